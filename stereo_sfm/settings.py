@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 T = TypeVar("T")
+KINDS: dict[object, str] = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
 
 
 def number(default: float, least: float, most: float, text: str) -> Any:
@@ -98,6 +99,11 @@ def read(tree: T, data: dict[str, Any], see: str) -> T:
     rules = dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple])
     try:
         done = dacite.from_dict(type(tree), merge(dataclasses.asdict(tree), data), rules)  # pyright: ignore[reportArgumentType]
+    except dacite.WrongTypeError as error:
+        wanted = KINDS.get(error.field_type, getattr(error.field_type, "__name__", str(error.field_type)))
+        raise StereoSfmError(
+            f"configuration: {error.field_path} is {str(error.value)[:80]!r}: it must be {wanted} (see '{see}')"
+        ) from None
     except dacite.DaciteError as error:
         raise StereoSfmError(f"configuration: {error} (see '{see}' for every key)") from None
     check(done)

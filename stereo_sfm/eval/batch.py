@@ -168,13 +168,13 @@ def table_row(name: str, result: dict[str, Any]) -> list[str]:
 
 
 def write_table(rows: Sequence[Sequence[str]], folder: Path) -> None:
-    """results.md and results.csv."""
+    """results.md, and results.csv, where what is missing is empty: its columns are read as numbers."""
     import csv
 
     lines = [f"| {' | '.join(r)} |" for r in (COLUMNS, ["---"] * len(COLUMNS), *rows)]
     (folder / "results.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     with (folder / "results.csv").open("w", newline="", encoding="utf-8") as stream:
-        csv.writer(stream).writerows([COLUMNS, *rows])
+        csv.writer(stream).writerows([COLUMNS, *(["" if cell == "-" else cell for cell in row] for row in rows)])
 
 
 def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:

@@ -25,7 +25,7 @@ from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbnail
-from stereo_sfm.recording.segments import RECORDING, Segment, new_recording
+from stereo_sfm.recording.segments import RECORDING, Segment, describe, new_recording
 from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage, WheelSamples
 
 EVERY_S = 2.0  # between two checks of the disk, besides those at the beginning of a segment
@@ -81,7 +81,9 @@ class SegmentRecorder:
             OSError: the folder cannot be made.
         """
         self._policy, self._disk = policy, disk
-        self.folder = new_recording(policy.root, source, policy.mode, datetime.now())
+        self._about = (source, policy.mode, datetime.now())
+        self.folder = new_recording(policy.root, *self._about)
+        self._folder_gone = False
         self._number, self._began_ns = 0, -1
         self.segment: Segment | None = None
         self._segment_ns = self._newest_ns = 0
@@ -174,8 +176,10 @@ class SegmentRecorder:
         p, written = self._policy, self._images.bytes_written + self._poses.bytes_written
         full = stamp_ns - self._segment_ns >= p.segment_s * 1e9 or written >= p.segment_bytes
         self._newest_ns = stamp_ns
-        if self.segment is not None and not full:
+        if self.segment is not None and not (full or self._folder_gone):
             return
+        if self._folder_gone:
+            self._make_folder_again()
         self.segment = Segment.of(self.folder, self._number, max(round((stamp_ns - self._began_ns) / 1e9), 0))
         self._number, self._segment_ns = self._number + 1, stamp_ns
         self._due.set()  # the quota is never exceeded by more than a segment, however fast they follow each other
@@ -185,6 +189,13 @@ class SegmentRecorder:
         if stamp_ns <= self._marked_until_ns:
             with contextlib.suppress(OSError):
                 self.segment.mark(self._mark_text)
+
+    def _make_folder_again(self) -> None:
+        """Somebody deleted the folder: the recording goes on in another one of its name."""
+        self._folder_gone = False
+        with contextlib.suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            describe(self.folder, *self._about)
 
     def _drop(self, image: StereoImage) -> None:
         self.images_dropped += 1
@@ -221,13 +232,15 @@ class SegmentRecorder:
 
     def _check_disk(self) -> None:
         p, current = self._policy, self.segment
+        self._folder_gone = not (self.folder / RECORDING).exists()
         if p.mode == "black_box":
             forget_images(p.root, p.black_box_s, p.segment_s, current)
         excess = make_room(p.root, p.quota, current, self._disk)
         self._used = used_bytes(p.root)
         disk = self._disk(p.root)
         if disk.free < p.quota.min_free:
-            self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {p.quota.min_free / 1e6:.0f} MB"
+            least = f"{p.quota.min_free / 1e6:.0f} MB (recording.min_free_gb)"
+            self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {least}"
         elif excess > (0 if current is None else current.bytes):
             self._no_room = "recordings that you marked fill the quota: delete some of them; images are not recorded"
         else:

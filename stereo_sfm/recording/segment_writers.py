@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import encode_pair, encode_pixels, image_message
@@ -84,7 +84,7 @@ class _Writer:
                 else:
                     self._write(item)
             except (StereoSfmError, OSError) as error:
-                self.problem = f"{error}"
+                self.problem = _said(error)
                 self._again_s = time.monotonic() + AGAIN_S
                 self._failed(item)
         with contextlib.suppress(StereoSfmError, OSError):
@@ -200,12 +200,18 @@ class PoseWriter(_Writer):
                 self.problem = ""
                 return
             except (StereoSfmError, OSError) as error:
-                self.problem = f"{error}"
+                self.problem = _said(error)
             time.sleep(AGAIN_S)
 
     def _finish(self) -> None:
         if self._log is not None:
             self._log.close()
+
+
+def _said(error: StereoSfmError | OSError) -> str:
+    """A line for people."""
+    known = from_os_error(error) if isinstance(error, OSError) else error
+    return f"cannot record: {error}" if known is None else str(known)
 
 
 def _unused(path: Path) -> Path:

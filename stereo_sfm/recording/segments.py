@@ -132,13 +132,22 @@ def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
     number = int(last[-1].name.partition("_")[0]) + 1 if last else 1
     folder = root / f"{number:05d}_{now:%Y-%m-%d_%H%M%S}"
     folder.mkdir()
-    about = {"kind": KIND, "version": 1, "source": source, "mode": mode, "began": now.isoformat(timespec="seconds")}
     try:
-        (folder / RECORDING).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        describe(folder, source, mode, now)
     except OSError:
         shutil.rmtree(folder, ignore_errors=True)
         raise
     return folder
+
+
+def describe(folder: Path, source: str, mode: str, began: datetime) -> None:
+    """Write the recording.json of a folder.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    about = {"kind": KIND, "version": 1, "source": source, "mode": mode, "began": began.isoformat(timespec="seconds")}
+    (folder / RECORDING).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
 
 
 def about(folder: Path) -> dict[str, Any]:

@@ -219,11 +219,14 @@ def make_publisher(module: str, config: RobotConfig) -> Publisher:
 
 def _open(publisher: Publisher, client: PipeClient, messages: Connection) -> bool:
     """Open an output, trying again while it cannot be; False when the service ended before that."""
+    said = ""
     while True:
         try:
             publisher.open(client)
             return True
         except StereoSfmError as error:
-            log.warning("%s; trying again every %.0f s", error, REOPEN_S)
+            if str(error) != said:
+                log.warning("%s; trying again every %.0f s", error, REOPEN_S)
+            said = str(error)
         if messages.poll(REOPEN_S):  # nothing is sent before it is open: this is the end
             return False

@@ -22,15 +22,19 @@ class HostClock:
     """The sensor's clock against this computer's clocks, from when images arrived.
 
     The offset is that of the image with the shortest delay among the newest ones. A step of the wall clock changes only
-    the wall clock times computed after it.
+    the wall clock times computed after it. A source that is not live has no clock that runs with this computer's: where
+    it is slower than its stamps say, each image is as old as its arrival.
     """
 
     def __init__(self) -> None:
+        self.live = True
         self._offsets: deque[int] = deque(maxlen=WINDOW)  # monotonic clock minus stamp
         self._captured: dict[int, float] = {}
 
     def image(self, frame_id: int, stamp_ns: int, captured_s: float) -> None:
         """An image was handed over by its driver at a time of the monotonic clock."""
+        if not self.live:
+            self._offsets.clear()
         self._offsets.append(int(captured_s * 1e9) - stamp_ns)
         self._captured[frame_id] = captured_s
         if len(self._captured) > WINDOW:

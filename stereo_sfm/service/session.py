@@ -102,7 +102,7 @@ class Session:
         try:
             with self._run as run:
                 info = run.info
-                self.serial = info.rig.serial
+                self.serial, self._clock.live = info.rig.serial, info.live
                 self._poses = PoseConverter(info.rig, self.number, self._clock)
                 self._corrections = CorrectionKeeper(self._opener.camera_store, info.rig, info.given_rig)
                 opening = self._folders.opening(self._opener.opening(info.rig))

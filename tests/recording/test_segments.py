@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -22,7 +23,7 @@ from stereo_sfm.recording import segment_recorder as module
 from stereo_sfm.recording import segment_writers
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_recorder import Policy, SegmentRecorder
-from stereo_sfm.recording.segments import RECORDING, Segment, delete_recording, listed, recordings, segments
+from stereo_sfm.recording.segments import RECORDING, Segment, about, delete_recording, listed, recordings, segments
 from stereo_sfm.types import Frame, ImuSamples, Observations, StereoImage, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
 
@@ -149,6 +150,26 @@ def test_images_that_wait_for_a_full_segment_do_not_end_the_next_one(tmp_path: P
         with open_source(segment.images) as alone:
             counts.append(sum(1 for _ in alone))
     assert counts[:2] == [8, 4], counts
+
+
+def test_a_folder_that_is_deleted_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "EVERY_S", 0.02)
+    images, recorder = list(SlidingWall(90)), start(tmp_path, segment_s=60.0)
+    record(recorder, images[:20])
+    wait_for(lambda: segments(recorder.folder))
+    shutil.rmtree(recorder.folder)
+    wait_for(lambda: recorder._folder_gone)  # pyright: ignore[reportPrivateUsage]
+    record(recorder, images[20:])
+    recorder.close(20.0)
+    assert about(recorder.folder)["source"] == "wall" and recorder.state().problem == ""
+    with open_source(recorder.folder) as source:
+        assert [image.frame_id for image in source] == list(range(20, 90))
+
+
+def test_the_reason_of_a_disk_that_refuses_is_a_sentence() -> None:
+    said = segment_writers._said(FileNotFoundError(2, "No such file or directory", "/r/a.mcap"))  # pyright: ignore
+    assert said == "/r/a.mcap: No such file or directory"
+    assert "Errno" not in segment_writers._said(OSError(28, "No space left on device"))  # pyright: ignore
 
 
 def test_a_folder_that_cannot_be_described_is_not_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,8 +43,8 @@ def test_a_token_is_made_where_none_is_configured(tmp_path: Path, monkeypatch: p
     file = tmp_path / "stereo-sfm" / "token"
     assert first.token == second.token == file.read_text().strip() and len(first.token) >= 32
     assert stat.S_IMODE(file.stat().st_mode) == 0o600 and list(file.parent.iterdir()) == [file]
-    monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path / 'of-the-unit'}:/other")  # as systemd sets it
-    assert token_file(SecurityConfig()) == tmp_path / "of-the-unit" / "token"
+    assert token_file(SecurityConfig()) == file
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "of-another-user"))
     assert access(SecurityConfig(), "::1").token != first.token
 
 

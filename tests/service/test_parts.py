@@ -133,6 +133,16 @@ def test_poses_are_in_the_map_that_their_frame_knew() -> None:
     assert maker.frame(frame(2, np.eye(4), 999)).map_version == 999
 
 
+def test_a_recording_that_is_slower_than_its_stamps_does_not_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HostClock()
+    clock.live = False
+    monkeypatch.setattr("time.monotonic_ns", lambda: int(150e9))
+    monkeypatch.setattr("time.time_ns", lambda: int(1_000_150e9))
+    for k in range(1000):  # 30 Hz by its stamps, 20 Hz on this computer
+        clock.image(k, k * 33 * MS, 100.0 + k * 0.05)
+        assert abs(clock.unix_ns(k * 33 * MS) - int((1_000_100.0 + k * 0.05) * 1e9)) < 1000
+
+
 def test_the_sensors_clock_is_that_of_the_fastest_image(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = HostClock()
     for k in range(1000):

@@ -31,7 +31,9 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
         ("[sorce]\nspec = ''", "there is no sorce, did you mean source"),
         ("[map]\nmode = 'extnd'", "did you mean extend"),
         ("[recording]\nquota_gb = -1", "must be from 0.01"),
-        ("[page]\nport = 'x'", "wrong value type"),
+        ("[page]\nport = 'x'", "page.port is 'x': it must be a whole number"),
+        ("[page]\nenabled = 'yes'", "page.enabled is 'yes': it must be true or false"),
+        ("[map]\nsave_every_min = []", "map.save_every_min is .*: it must be a number"),
         ("[source", "Expected"),
     ],
 )

@@ -177,12 +177,9 @@ def token(security: SecurityConfig) -> str:
 
 
 def token_file(security: SecurityConfig) -> Path:
-    """Where the token is: as configured, else in the folder for the state of the service or of its user."""
+    """Where the token is: as configured, else in the folder for the state of the service's user."""
     if security.token_file:
         return Path(security.token_file)
-    own = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # set by systemd
-    if own:
-        return Path(own) / "token"
     return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stereo-sfm" / "token"
 
 

@@ -1,0 +1,370 @@
+"""Attacks on a running service and hostile files for its commands, from this computer alone: what became of each.
+
+    python -m benchmarks attack -- [--only WORD] [--requests N]
+
+A service plays the bundled recording with the page, Foxglove and the pose socket on. Each attack is carried out for
+real and its row says what happened; between two attacks a client with the token must still get poses. Files are given
+to commands in processes of their own. The exit code is the number of attacks that found something open.
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import json
+import os
+import random
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from tests.service.hostile import frames, request, status
+
+START_S = 600.0  # for the service to have a pose: kernels may be compiled, and the computer may be busy
+STOP_S = 5.0
+MOST_MB = 600  # of a command that reads a hostile file
+HANG_S = 60.0
+BEARER = "Bearer "
+
+Outcome = tuple[str, bool]  # what happened, whether the door is closed
+
+
+@dataclass
+class Target:
+    """A running service."""
+
+    folder: Path
+    page: int
+    foxglove: int
+    poses: int
+    requests: int
+    process: subprocess.Popen[str] = field(repr=False)
+    said: str = ""  # its log, when it has ended
+
+    @property
+    def token(self) -> str:
+        return (self.folder / "state" / "stereo-sfm" / "token").read_text().strip()
+
+    def ask(self, path: str, method: str = "GET", body: bytes | None = None, **headers: str) -> int:
+        """The status of an answer of the page, 0 for none."""
+        return self.tell(path, method, body, **headers)[0]
+
+    def tell(self, path: str, method: str = "GET", body: bytes | None = None, **headers: str) -> tuple[int, str]:
+        """Status and text of an answer of the page."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.page, timeout=10)
+        try:
+            connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+            answer = connection.getresponse()
+            return answer.status, answer.read(1 << 16).decode("utf-8", "replace")
+        except OSError:
+            return 0, ""
+        finally:
+            connection.close()
+
+    def open_pose_socket(self, token: str = "") -> socket.socket:
+        client = socket.create_connection(("127.0.0.1", self.poses), 10)
+        if token:
+            client.sendall(token.encode() + b"\n")
+        return client
+
+    def pose_within(self, seconds: float) -> float:
+        """Seconds until a new client with the token has a pose; infinite when it gets none."""
+        begin = time.monotonic()
+        while time.monotonic() - begin < seconds:
+            with suppress(OSError), self.open_pose_socket(self.token) as client:
+                client.settimeout(max(seconds - (time.monotonic() - begin), 0.1))
+                if client.makefile().readline():
+                    return time.monotonic() - begin
+            time.sleep(0.2)
+        return float("inf")
+
+    def upgrade(self, path: str = "/", **headers: str) -> int:
+        """The status of a handshake with Foxglove's WebSocket, 101 where it succeeds."""
+        given = {"Host": f"127.0.0.1:{self.foxglove}", **{k.replace("_", "-"): v for k, v in headers.items()}}
+        fixed = {
+            "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Protocol": "foxglove.websocket.v1",
+        }  # fmt: skip
+        lines = [f"GET {path} HTTP/1.1", *(f"{k}: {v}" for k, v in {**given, **fixed}.items()), "", ""]
+        return status(self.foxglove, "\r\n".join(lines).encode(), False)
+
+
+# -- attacks: each docstring is the attack's name in the table ---------------------------------------------------------
+
+
+def foreign_page(t: Target) -> Outcome:
+    """a page of another site commands through Foxglove's WebSocket"""
+    own = {"Authorization": BEARER + t.token}
+    found = [t.upgrade(Origin="https://evil.example", **own), t.upgrade(Host="evil.example", **own)]
+    good = [t.upgrade(**own), t.upgrade(Origin="https://app.foxglove.dev", **own)]
+    return f"foreign Origin, Host: {found}; own client, Foxglove: {good}", found == [403, 421] and good == [101, 101]
+
+
+def without_a_token(t: Target) -> Outcome:
+    """a local user without the token sees, stops, deletes"""
+    json_ = {"Content_Type": "application/json", "X_Stereo_Sfm": "1"}
+    codes = [t.ask(p) for p in ("/api/image.jpg", "/api/live", "/api/recordings")]
+    codes += [t.ask("/api/command/stop_recording", "POST", b"{}", **json_), t.upgrade()]
+    with t.open_pose_socket() as client:
+        client.settimeout(7.0)
+        poses = client.recv(1)
+    return f"page and Foxglove: {sorted(set(codes))}; poses: {len(poses)} bytes", set(codes) == {401} and not poses
+
+
+def files_of_others(t: Target) -> Outcome:
+    """another user reads token, recordings, map"""
+    readable = [p for p in t.folder.rglob("*") if p.is_file() and p.stat().st_mode & 0o007]
+    count = sum(p.is_file() for p in t.folder.rglob("*"))
+    return f"{len(readable)} of {count} files are readable by others", not readable and count > 3
+
+
+def a_link_twice(t: Target) -> Outcome:
+    """the printed link is used twice"""
+    command = [sys.executable, "-m", "stereo_sfm.cli", "serve", *_settings(t), "--print-link"]
+    link = subprocess.run(command, capture_output=True, text=True, env=_environment(t.folder), check=True).stdout
+    body = json.dumps({"token": link.strip().partition("#")[2]}).encode()
+    codes = [t.ask("/login", "POST", body, Content_Type="application/json") for _ in range(2)]
+    return f"log-ins: {codes}", codes == [200, 401]
+
+
+def idle_connections(t: Target) -> Outcome:
+    """70 idle connections to the page"""
+    with ExitStack() as idle:
+        for _ in range(70):
+            idle.enter_context(socket.create_connection(("127.0.0.1", t.page), 5))
+        codes = Counter(t.ask("/api/map", Authorization=BEARER + t.token) for _ in range(10))
+    return f"with the token: {dict(codes)}", codes[200] == 10
+
+
+def silent_connections(t: Target) -> Outcome:
+    """40 silent connections to the pose socket"""
+    with ExitStack() as silent:
+        for _ in range(40):
+            silent.enter_context(socket.create_connection(("127.0.0.1", t.poses), 5))
+        seconds = t.pose_within(10)
+    return f"a client with the token has a pose after {seconds:.1f} s", seconds < 5
+
+
+def slow_handshakes(t: Target) -> Outcome:
+    """one byte a second keeps a handshake open"""
+    took: list[float] = []
+    for port in (t.page, t.foxglove, t.poses):
+        begin = time.monotonic()
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port), 5) as client:
+            while time.monotonic() - begin < 20:
+                client.sendall(b"G")
+                time.sleep(0.5)
+        took.append(time.monotonic() - begin)
+    return "closed after " + ", ".join(f"{s:.1f}" for s in took) + " s", max(took) < 8
+
+
+def clients_that_never_read(t: Target) -> Outcome:
+    """32 clients with the token never read"""
+    with ExitStack() as held:
+        for _ in range(32):
+            client = socket.socket()
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            client.connect(("127.0.0.1", t.poses))
+            client.sendall(t.token.encode() + b"\n")
+            held.enter_context(client)
+        seconds = t.pose_within(60)
+    return f"another one has a pose after {seconds:.1f} s", seconds < 60
+
+
+def guesses(t: Target) -> Outcome:
+    """tokens are guessed; the operator is logged in"""
+    code, _ = t.tell("/login", "POST", json.dumps({"token": t.token}).encode(), Content_Type="application/json")
+    answered = 0
+    begin = time.monotonic()
+    for k in range(200):
+        answered += t.ask("/api/map", Authorization=f"{BEARER}guess number {k}") == 401
+        body = json.dumps({"token": f"guess number {k}"}).encode()
+        answered += t.ask("/login", "POST", body, Content_Type="application/json") == 401
+    seconds = time.monotonic() - begin
+    time.sleep(3.0)  # all of this is one user
+    again = t.ask("/api/map", Authorization=BEARER + t.token)
+    text = f"{answered} of 400 looked at in {seconds:.0f} s; the token afterwards: {again}"
+    return text, code == 200 and answered <= 6 + seconds and again == 200
+
+
+def hostile_requests(t: Target) -> Outcome:
+    """hostile requests and WebSocket messages"""
+    rng = random.Random(1)
+    ports = (t.page, t.foxglove)
+    found = Counter(status(ports[k % 2], request(rng, ports[k % 2], t.token)) // 100 for k in range(t.requests))
+    said = 0
+    with suppress(ImportError, OSError):
+        from websockets.exceptions import ConnectionClosed
+        from websockets.sync.client import connect
+
+        address = f"ws://127.0.0.1:{t.foxglove}/?token={t.token}"
+        with connect(address, subprotocols=["foxglove.sdk.v1"], max_queue=None) as client, suppress(ConnectionClosed):  # type: ignore[list-item]
+            for frame in frames(rng, t.requests // 4):
+                client.send(frame)
+                said += 1
+    alive = t.ask("/api/map", Authorization=BEARER + t.token)
+    rows = ", ".join(f"{count} {kind}xx" if kind else f"{count} closed" for kind, count in sorted(found.items()))
+    return f"{rows}; {said} messages; the page afterwards: {alive}", not found[5] and alive == 200
+
+
+def a_map_over_recordings(t: Target) -> Outcome:
+    """save_map writes into the recordings"""
+    headers = {"Content_Type": "application/json", "X_Stereo_Sfm": "1", "Authorization": BEARER + t.token}
+    _, text = t.tell("/api/command/save_map", "POST", b'{"name": "recordings"}', **headers)
+    return json.loads(text)["text"][:80], not (t.folder / "recordings" / "map.json").exists()
+
+
+def two_writers(t: Target) -> Outcome:
+    """record --overwrite into a file that is being recorded"""
+    file, demo = t.folder / "drive.mcap", ROOT / "recordings" / "demo.mcap"
+    command = [sys.executable, "-m", "stereo_sfm.cli", "record", str(demo), "-q", "--overwrite", "-o", str(file)]
+    first = subprocess.Popen([*command, "--realtime"], env=_environment(t.folder), stderr=subprocess.PIPE, text=True)
+    while not file.exists() and first.poll() is None:
+        time.sleep(0.01)
+    second = subprocess.run(command, env=_environment(t.folder), capture_output=True, text=True)
+    first.terminate()
+    first.wait(30)
+    said = second.stderr.strip().splitlines()[-1:] or [""]
+    return f"exit code {second.returncode}: {said[0][-70:]}", second.returncode == 2 and "is writing" in said[0]
+
+
+def hostile_files(t: Target) -> Outcome:
+    """pipes, devices and bombs given to commands"""
+    folder = t.folder / "files"
+    folder.mkdir(exist_ok=True)
+    pipe, zero, nested = folder / "pipe.mcap", folder / "zero.mcap", folder / "nested.toml"
+    with suppress(FileExistsError):
+        os.mkfifo(pipe)
+        zero.symlink_to("/dev/zero")
+    nested.write_text("a = " + "[" * 100_000)
+    wrong: list[str] = []
+    commands = [
+        ["recover", str(pipe), "-o", str(folder / "o.mcap")], ["info", str(pipe)], ["info", str(zero)],
+        ["recover", str(zero), "-o", str(folder / "o.mcap")], ["run", str(zero)], ["run", "sim:loop", "-c", str(zero)],
+        ["serve", "-c", str(nested), "--print-ports"], ["serve", "-c", str(pipe), "--print-ports"],
+        ["convert-calib", str(zero), str(folder / "rig.yaml")], ["map", "info", str(pipe)],
+    ]  # fmt: skip
+    for command in commands:
+        begin = time.monotonic()
+        found = subprocess.Popen(
+            [sys.executable, "-m", "stereo_sfm.cli", *command], env=_environment(t.folder), stderr=subprocess.PIPE,
+            stdout=subprocess.DEVNULL, text=True, preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (50, 60)),
+        )  # fmt: skip
+        try:
+            _, said = found.communicate(timeout=HANG_S)
+        except subprocess.TimeoutExpired:
+            found.kill()
+            found.communicate()
+            wrong.append(f"{command[0]} hangs")
+            continue
+        if found.returncode != 2 or "Traceback" in said:
+            wrong.append(f"{command[0]}: exit code {found.returncode} after {time.monotonic() - begin:.0f} s")
+    most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    wrong += [f"{most:.0f} MB"] if most > MOST_MB else []
+    return "; ".join(wrong) or f"{len(commands)} commands, one line each, {most:.0f} MB at most", not wrong
+
+
+ATTACKS: tuple[Callable[[Target], Outcome], ...] = (
+    foreign_page, without_a_token, a_link_twice, idle_connections, silent_connections, slow_handshakes,
+    clients_that_never_read, guesses, hostile_requests, a_map_over_recordings, files_of_others, two_writers,
+    hostile_files,
+)  # fmt: skip
+
+
+# -- the service -------------------------------------------------------------------------------------------------------
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    path = os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "XDG_STATE_HOME": str(folder / "state"), "PYTHONPATH": path}
+
+
+def _settings(t: Target) -> list[str]:
+    return [
+        word
+        for text in (
+            f"page.enabled=true,page.port={t.page},outputs.foxglove.enabled=true,outputs.foxglove.port={t.foxglove},"
+            f"outputs.pose_socket.enabled=true,outputs.pose_socket.address=tcp://127.0.0.1:{t.poses},"
+            f"map.folder={t.folder / 'store'},recording.folder={t.folder / 'recordings'},recording.mode=full,"
+            "source.repeat=true,map.save_every_min=0.2"
+        ).split(",")
+        for word in ("--set", text)
+    ]
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@contextmanager
+def running(requests: int) -> Iterator[Target]:
+    """A service that plays the bundled recording again and again."""
+    with tempfile.TemporaryDirectory(prefix="attack") as name:
+        folder = Path(name)
+        target = Target(folder, _free_port(), _free_port(), _free_port(), requests, None)  # type: ignore[arg-type]
+        source = str(ROOT / "recordings" / "demo.mcap")
+        with (folder.with_name(f"{folder.name}.log")).open("w+") as log:
+            target.process = subprocess.Popen(
+                [sys.executable, "-m", "stereo_sfm.cli", "serve", source, *_settings(target)],
+                env=_environment(folder), stdout=log, stderr=subprocess.STDOUT, text=True,
+            )  # fmt: skip
+            try:
+                while not (folder / "state" / "stereo-sfm" / "token").exists() and target.process.poll() is None:
+                    time.sleep(0.1)
+                if target.pose_within(START_S) > START_S:
+                    raise SystemExit("the service has no poses")
+                yield target
+            finally:
+                target.process.kill()
+                target.process.wait()
+                log.seek(0)
+                target.said = log.read()
+                Path(log.name).unlink()
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", metavar="WORD", help="attacks whose name has this word")
+    parser.add_argument("--requests", type=int, default=2000, metavar="N", help="hostile requests")
+    args = parser.parse_args()
+    rows: list[tuple[str, str, bool]] = []
+
+    def report(name: str, what: str, closed: bool) -> None:
+        rows.append((name, what, closed))
+        print(f"{name:58}  {'closed' if closed else 'OPEN':6}  {what}", flush=True)
+
+    with running(args.requests) as target:
+        for attack in ATTACKS:
+            name = (attack.__doc__ or attack.__name__).strip()
+            if args.only in name:
+                report(name, *attack(target))
+                if (seconds := target.pose_within(30)) > 10:
+                    report("  afterwards", f"the next client has a pose after {seconds:.0f} s", False)
+        begin = time.monotonic()
+        target.process.send_signal(signal.SIGTERM)
+        with suppress(subprocess.TimeoutExpired):
+            target.process.wait(3 * STOP_S)
+        seconds = time.monotonic() - begin
+        saved = (target.folder / "store" / "map.json").exists()
+        report("SIGTERM afterwards", f"{seconds:.1f} s, map saved: {saved}", seconds <= STOP_S and saved)
+    report("the service's log", f"{target.said.count('Traceback')} tracebacks", "Traceback" not in target.said)
+    return sum(not closed for _, _, closed in rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
