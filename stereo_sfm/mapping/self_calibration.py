@@ -45,7 +45,8 @@ INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])  # windows that each term needs:
 ENOUGH_WINDOWS = 4  # for halves of two windows each
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
-AFTER_STEP = range(4, 9)  # newest windows that must contradict all others to indicate a step
+AFTER_STEP = range(4, 11)  # newest windows that must contradict all others to indicate a step; they look elsewhere:
+ELSEWHERE_RAD, ELSEWHERE_WINDOWS = 0.35, 8  # they have turned by a third of a usual view, or are so many
 BEFORE_STEP = 4  # earlier windows needed to detect a step
 STEP_REACH = 2  # windows before and after the likeliest pair of windows in which it may have happened
 RECENT_KEYFRAMES = 64  # among which the first after a step is looked for
@@ -375,8 +376,9 @@ class SelfCalibration:
 
     def _step(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
         """Whether there is a significant change that each half of the windows after it shows."""
+        turned = sum(float(np.linalg.norm(w.turn)) for w in after)
         change = self._across_windows(before, after)
-        if change.reach < STEP_SIGMAS:
+        if change.reach < STEP_SIGMAS or (turned < ELSEWHERE_RAD and len(after) < ELSEWHERE_WINDOWS):
             return False
         halves = [self._across_windows(before, part) for part in (after[::2], after[1::2])]
         sigmas = np.where(self._taken_back, np.inf, STEP_SIGMAS)

@@ -155,7 +155,7 @@ def test_a_fisheye_has_no_decentering() -> None:
 def test_a_step_is_detected_and_earlier_keyframes_keep_their_rig() -> None:
     true = RIGS["pinhole"]
     knocked = turned(true, (0.0, 0.2, 0.0))
-    estimator, found = revisions([true] * 40 + [knocked] * 40, true, 1)
+    estimator, found = revisions([true] * 40 + [knocked] * 64, true, 1)
     assert found[0].why == "step" and found[0].since_kf_id == 40
     assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.2, abs=0.02)
 
@@ -203,21 +203,21 @@ def test_the_first_keyframe_after_a_step_is_found(name: str, degrees: tuple[floa
 def test_a_small_step_is_detected_when_more_windows_show_it() -> None:
     """Not mistaken for a smaller error of the whole run."""
     true = RIGS["pinhole"]
-    estimator, found = revisions([true] * 32 + [turned(true, (0.0, 0.1, 0.0))] * 40, true, 0)
-    assert found[0].why == "step" and found[0].since_kf_id == 32
+    estimator, found = revisions([true] * 40 + [turned(true, (0.0, 0.1, 0.0))] * 88, true, 0)
+    assert found[0].why == "step" and found[0].since_kf_id == 40
     assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.1, abs=0.015)
 
 
 def test_a_step_within_a_window_is_estimated_from_the_windows_after_it() -> None:
     true = RIGS["pinhole"]
-    _, found = revisions([true] * 29 + [turned(true, (0.0, 0.2, 0.0))] * 40, true, 0)
-    assert found[0].why == "step" and 27 <= found[0].since_kf_id <= 31
+    _, found = revisions([true] * 37 + [turned(true, (0.0, 0.2, 0.0))] * 64, true, 0)
+    assert found[0].why == "step" and 35 <= found[0].since_kf_id <= 39
     assert np.rad2deg(found[0].terms[1]) == pytest.approx(0.2, abs=0.015)
 
 
 def test_the_map_is_right_before_and_after_a_step() -> None:
     true = RIGS["pinhole"]
-    rigs = [true] * 40 + [turned(true, (0.0, 0.2, 0.0))] * 40
+    rigs = [true] * 40 + [turned(true, (0.0, 0.2, 0.0))] * 64
     mapper = Mapper(MapperConfig(association="tracks"), true, calibration=SelfCalibration(true))
     for keyframe in keyframes(rigs, true, 1, noise_px=0.05):
         mapper.step(keyframe)
@@ -225,7 +225,7 @@ def test_the_map_is_right_before_and_after_a_step() -> None:
     at, path = mapper.map.keyframes.map_T_kf[:, :3, 3], camera_path(len(rigs))[:, :3, 3]
     for part in (slice(0, 40), slice(40, None)):
         length, true_length = (np.linalg.norm(np.diff(x[part], axis=0), axis=1).sum() for x in (at, path))
-        assert length / true_length == pytest.approx(1.0, abs=0.015)
+        assert length / true_length == pytest.approx(1.0, abs=0.02)
 
 
 def drifting(name: str, axis: int, count: int = 320) -> tuple[list[Rig], F64]:
