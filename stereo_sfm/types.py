@@ -308,7 +308,7 @@ class CalibrationUpdate(Message):
     terms_covariance: F64  # (8, 8)
     since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay, or drift towards it
     applied: bool  # False: only reported
-    why: str  # "significant", "step", "refined" or "drift"
+    why: str  # "significant", "step", "refined", "drift", or "kept" from the session before
     text: str  # human-readable
 
     def __post_init__(self) -> None:

@@ -41,7 +41,7 @@ class Extension(Mapper):
         """Args: localizer, in the saved map, without a self-calibration of its own; the others as the mapper's."""
         super().__init__(config, rig, spans, loop_config, calibration, sensors)
         self._localizer = localizer
-        self._misplaced = True  # no keyframe was relocalized since the rig was corrected
+        self._misplaced = True  # no keyframe that was tracked with the corrected rig has been relocalized
         self._saved_T_session: F64 | None = None
         self._found: Location | None = None  # of the first relocalized keyframe
         self._found_kf: tuple[int, F64] = -1, np.eye(4)  # a living keyframe, and the relocalized one's pose in it
@@ -56,7 +56,7 @@ class Extension(Mapper):
             if self._localizer.last is not None and self._localizer.last.found:
                 self._found, self._found_kf = self._localizer.last, (keyframe.kf_id, np.eye(4))
                 self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
-                self._misplaced = False
+                self._misplaced = not np.array_equal(keyframe.rig_terms, self._terms)
                 update = self._with_everything(update)
         if self._saved_T_session is None:
             return update

@@ -84,10 +84,14 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     if folders.map_in is None:
         return Mapper(config.mapper, rig, spans, config.loop, wanted, sensors)
     from stereo_sfm.maps.extension import Extension
+    from stereo_sfm.maps.kept_correction import KeptCorrection
     from stereo_sfm.maps.localizer import Localizer
     from stereo_sfm.maps.saved_map import load_map
 
     saved = load_map(folders.map_in, rig)
+    kept = saved.correction_of(rig)
+    if wanted is not None and wanted.applies and kept.any():
+        wanted = KeptCorrection(rig, kept, wanted.applies)
     vocabulary, own = configured_vocabulary(config.loop), saved.keyframe_rigs([rig])
     if folders.localize_only:
         return Localizer(saved.snapshot, rig, vocabulary, config.loop, own, wanted)

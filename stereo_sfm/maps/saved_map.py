@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.arrays import read_arrays
-from stereo_sfm.calib.formats.native import read_native, write_native
+from stereo_sfm.calib.formats.native import read_native, rig_to_text, write_native
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
@@ -33,7 +33,7 @@ from stereo_sfm.maps.header import (
     write_header,
 )
 from stereo_sfm.maps.replace_folder import replaced_folder
-from stereo_sfm.types import I64, MapUpdate, Trajectory
+from stereo_sfm.types import F64, I64, RIG_TERMS, MapUpdate, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -68,6 +68,12 @@ class SavedMap:
     def rig(self) -> Rig:
         """The rig of the newest session."""
         return self.cameras[int(self.sessions.max())].rig
+
+    def correction_of(self, rig: Rig) -> F64:
+        """(8,) terms that the newest session of a camera found of its calibration; zeros if there is none."""
+        text = rig_to_text(rig)
+        found = [self.cameras[k].terms for k in self.session_ids if self.cameras[k].text == text]
+        return found[-1] if found else np.zeros(RIG_TERMS)
 
     def keyframe_rigs(self, first: Sequence[Rig] = ()) -> list[Rig]:
         """The rig of each keyframe, one object for equal ones; of those equal to one of `first`, that object."""
