@@ -6,15 +6,17 @@ import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from stereo_sfm.calib.formats.native import rig_from_text, rig_to_text
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.start import ADVICE, StartFinding, check_start
 from stereo_sfm.drivers.source import Source, Stamps, chosen_frames
 from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StartCheck, StereoImage
+
+if TYPE_CHECKING:
+    from stereo_sfm.calib.start import StartFinding
 
 log = logging.getLogger("stereo_sfm")
 
@@ -78,6 +80,8 @@ class StartCheckedSource(WrappedSource):
         """Look at the first images now. An error of the source is raised when they are passed on, in its place."""
         if self._looked_at:
             return
+        from stereo_sfm.calib.start import check_start
+
         self._looked_at = True
         first = _FirstImages(iter(self.source))
         finding = check_start(self.source.rig, first.looked_at())
@@ -86,6 +90,8 @@ class StartCheckedSource(WrappedSource):
         self._images = first.passed_on()
 
     def _report(self, finding: StartFinding, first: StereoImage) -> StartCheck:
+        from stereo_sfm.calib.start import ADVICE
+
         better, remedy, rig, shift = finding.rig, "", "", 0
         if better is not None and self._correct:
             remedy, rig, shift = f"corrected for this run; {ADVICE}", _as_text(better), finding.shift

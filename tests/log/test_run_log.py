@@ -49,6 +49,7 @@ from stereo_sfm.types import (
     Observations,
     RowErrors,
     SensorUpdate,
+    StartCheck,
     TrackState,
 )
 from tests.log.recordings import (
@@ -110,6 +111,9 @@ def _calibration(k: int) -> CalibrationUpdate:
     return CalibrationUpdate(k + 1, k, START_NS, terms, np.diag(terms**2), 2, True, "step", "turned")
 
 
+START_CHECK = StartCheck(0, START_NS, "the right camera is turned", "corrected", True, "stereo_sfm_rig: 1\n", -1)
+
+
 def _sensors(k: int) -> SensorUpdate:
     return SensorUpdate(
         k + 1, k, START_NS, np.arange(4) * 1e-3, np.full(4, np.inf), np.arange(8) * 1e-3, np.ones(8), "wheels' scale"
@@ -160,6 +164,7 @@ def _write(path: Path, order: np.random.Generator | None, imu: Imu | None = None
         log.put(alive[0 if order is None else order.integers(len(alive))].pop())
     log.put(Applied(1, 3))
     log.put(Dropped(9, START_NS, "ring", "full", 2))
+    log.put(START_CHECK)
     log.put(Health("track", 5, 30.0, 1, 1.0, 2.0, 3.0, 0))
     log.put(StageTimes(5, {"track": 3.5}))
     log.put(SourceCounters(5, {"pairs": 6.0, "stalls": 1.0}))
@@ -416,6 +421,7 @@ def test_the_input_of_a_replay_is_read_back(run: Path) -> None:
     assert recorded.config == Config()
     assert recorded.applied == [Applied(1, 3)]
     assert recorded.dropped == [Dropped(9, START_NS, "ring", "full", 2)]
+    assert recorded.start_check == START_CHECK
     assert {"Frame", "Keyframe", "TrackStats", "StageTimes", "CompressedImage", "PointCloud", "Log"} <= kinds
 
 
