@@ -56,6 +56,7 @@ Reading = TypeVar("Reading", ImuReading, WheelReading)
 
 _STATIC_NS = 10_000_000_000  # fixed transforms among moving ones must come within the first ten seconds
 _STEP_BACK_NS = 200_000_000  # messages of several threads may be out of order by less
+FIRST = 5  # images of which one must be readable
 _WAITING_BYTES = 1 << 28  # of images of one camera that wait for the other: logs may be written in bursts
 
 
@@ -169,16 +170,22 @@ class ForeignSource(BaseSource):
         self, frame_id: int, left: _StampedImage, other: _StampedImage | None, dropped: int
     ) -> StereoImage | None:
         try:
-            pixels = eight_bits(left.message.gray(), self._bits)
-            right = eight_bits(other.message.gray(), self._bits) if other and self.topics.right else None
-            depth = other.message.depth() if other and self.topics.depth else None
-        except UnknownEncoding as error:
-            raise StereoSfmError(f"{self.name}: {error}: record or convert them in one of these") from None
+            return self._decoded(frame_id, left, other, dropped)
         except BAD_MESSAGE as error:
             self._unreadable += 1
             if self._unreadable <= SHOWN_WARNINGS:
                 log.warning("%s: image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
             return None
+
+    def _decoded(self, frame_id: int, left: _StampedImage, other: _StampedImage | None, dropped: int) -> StereoImage:
+        """Raises one of `BAD_MESSAGE` for an image that cannot be read, StereoSfmError where none can, or another size
+        than the calibration's."""
+        try:
+            pixels = eight_bits(left.message.gray(), self._bits)
+            right = eight_bits(other.message.gray(), self._bits) if other and self.topics.right else None
+            depth = other.message.depth() if other and self.topics.depth else None
+        except UnknownEncoding as error:
+            raise StereoSfmError(f"{self.name}: {error}: record or convert them in one of these") from None
         self._check_size("left", pixels.shape, self.rig.left.size)
         if right is not None and self.rig.right is not None:
             self._check_size("right", right.shape, self.rig.right.size)
@@ -340,11 +347,17 @@ class ForeignSource(BaseSource):
                         yield image.message.gray()
 
     def _check_first(self) -> None:
-        """Raises StereoSfmError before the first frame if the images do not match the calibration."""
-        for left, other in self._pairs(None, None, [], []):
-            if self._used(other):
-                self._decode(0, left, other, 0)
+        """Raises StereoSfmError before the first frame if the images cannot be read or do not match the calibration."""
+        used = ((left, other) for left, other in self._pairs(None, None, [], []) if self._used(other))
+        why = None
+        for left, other in itertools.islice(used, FIRST):
+            try:
+                self._decoded(0, left, other, 0)
                 return
+            except BAD_MESSAGE as error:
+                why = error
+        if why is not None:
+            raise StereoSfmError(f"{self.name}: its images cannot be read: {why}")
 
     def _check_size(self, what: str, shape: tuple[int, ...], size: tuple[int, int]) -> None:
         if (shape[1], shape[0]) != size:

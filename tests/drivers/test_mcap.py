@@ -569,6 +569,18 @@ def test_an_encoding_that_cannot_be_read_is_refused_once(tmp_path: Path, capsys:
     assert "'yuv_of_the_future' is not supported" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
 
 
+def test_images_that_are_too_short_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def image(i: int, side: int, frame: str) -> RawImage:
+        message = _raw(i, side, frame)
+        message.encoding, message.step = "bayer_rggb16", 2 * W
+        return message
+
+    path = _write(tmp_path / "a.mcap", image=image)
+    assert f"its images cannot be read: an image of {W}x{H} bayer_rggb16 has only" in _error(path, capsys)
+    assert main(["info", str(path)]) == 0
+    assert capsys.readouterr().out.count("bayer_rggb16") == 1
+
+
 def test_compressed_images_that_are_video_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def image(i: int, side: int, frame: str) -> CompressedImage:
         return CompressedImage(frame_id=frame, data=b"\0\0\0\1", format="h264")
