@@ -116,14 +116,15 @@ def _camera(data: dict[str, Any], resolution: Any) -> Camera:
         return brown((width, height), (fx, fy), (cx, cy), coefficients)
     if kind in _SPHERES:
         model, names = _SPHERES[kind]
-        return model(width, height, fx, fy, cx, cy, tuple(numbers([p.get(k, 1.0) for k in names])))
+        return model.published(width, height, fx, fy, cx, cy, tuple(numbers([p.get(k, 1.0) for k in names])))
     raise ValueError(
         f"camera type '{kind}' is not supported (supported: kb4, pinhole, pinhole-radtan8, {', '.join(_SPHERES)})"
     )
 
 
 def _plain(camera: Camera) -> dict[str, Any]:
-    p = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    fx, fy = camera.published_focal
+    p = {"fx": fx, "fy": fy, "cx": camera.cx, "cy": camera.cy}
     if camera.model == "kannala_brandt":
         kind = "kb4"
         p |= dict(zip(("k1", "k2", "k3", "k4"), padded(camera, 4), strict=True))

@@ -36,7 +36,7 @@ def colmap_camera(model: str, width: int, height: int, params: list[float], shif
         return KannalaBrandt(width, height, fx, fy, cx - shift, cy - shift, tuple(k))
     if model == "FOV":
         fx, fy, cx, cy, w = numbers(params, 5)
-        return Fov(width, height, fx, fy, cx - shift, cy - shift, (w,))
+        return Fov.published(width, height, fx, fy, cx - shift, cy - shift, (w,))
     if model not in _BROWN_MODELS:
         raise ValueError(
             f"camera model '{model}' is not supported (supported: {', '.join(_BROWN_MODELS)}, OPENCV_FISHEYE, FOV)"
@@ -50,7 +50,7 @@ def colmap_camera(model: str, width: int, height: int, params: list[float], shif
 
 def colmap_params(camera: Camera, shift: float = 0.5) -> tuple[str, list[float]]:
     """COLMAP's model name and parameters of a camera."""
-    base = [float(v) for v in (camera.fx, camera.fy, camera.cx + shift, camera.cy + shift)]
+    base = [float(v) for v in (*camera.published_focal, camera.cx + shift, camera.cy + shift)]
     if camera.model == "kannala_brandt":
         return "OPENCV_FISHEYE", base + padded(camera, 4)
     if camera.model == "pinhole":

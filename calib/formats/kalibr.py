@@ -119,11 +119,11 @@ def _camera(data: dict[str, Any]) -> Camera:
     *own, fx, fy, cx, cy = numbers(data["intrinsics"], 4 + before)
     if kind == "pinhole" and distortion in ("equidistant", "fov"):
         lens, count = (KannalaBrandt, 4) if distortion == "equidistant" else (Fov, 1)
-        return lens(width, height, fx, fy, cx, cy, tuple(numbers(coefficients, count)))
+        return lens.published(width, height, fx, fy, cx, cy, tuple(numbers(coefficients, count)))
     if kind == "pinhole" and distortion in ("radtan", "none"):
         return brown((width, height), (fx, fy), (cx, cy), coefficients)
     if distortion == "none" or (kind == "omni" and distortion == "radtan"):
-        return model(width, height, fx, fy, cx, cy, (*own, *coefficients))
+        return model.published(width, height, fx, fy, cx, cy, (*own, *coefficients))
     allowed = {"pinhole": "radtan, equidistant, fov, none", "omni": "radtan, none"}.get(kind, "none")
     raise StereoSfmError(f"Kalibr distortion model '{distortion}' of {kind} is not supported (supported: {allowed})")
 
@@ -145,7 +145,7 @@ def _plain(camera: Camera, cam_T_imu: Any) -> dict[str, Any]:
     return {
         "T_cam_imu": rows(cam_T_imu),
         "camera_model": kind,
-        "intrinsics": [*coefficients[:before], float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)],
+        "intrinsics": [*coefficients[:before], *camera.published_focal, float(camera.cx), float(camera.cy)],
         "distortion_model": name,
         "distortion_coeffs": coefficients[before:],
         "resolution": [camera.width, camera.height],

@@ -70,5 +70,5 @@ def _camera(data: dict[str, Any]) -> Camera:
         return KannalaBrandt(*size, fx, fy, cx, cy, tuple(k))
     coefficients = numbers([data[f"distortion_parameters.{name}"] for name in _BROWN])
     if kind == "MEI":
-        return Mei(*size, fx, fy, cx, cy, (float(data["mirror_parameters.xi"]), *coefficients))
+        return Mei.published(*size, fx, fy, cx, cy, (float(data["mirror_parameters.xi"]), *coefficients))
     return brown(size, (fx, fy), (cx, cy), coefficients)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -23,7 +23,11 @@ RADII, RADII_AT_ONCE = np.linspace(0, 20, 40001), 2000  # normalised radii tried
 
 @dataclass(frozen=True, eq=False)
 class Camera(ReadOnly):
-    """One camera: image size in pixels, focal lengths and principal point in pixels, distortion coefficients."""
+    """One camera: image size in pixels, focal lengths and principal point in pixels, distortion coefficients.
+
+    The focal length is that of the image's centre, pixels per radian, for all models: some are published with another
+    one (`published`).
+    """
 
     width: int
     height: int
@@ -44,6 +48,7 @@ class Camera(ReadOnly):
             raise ValueError(f"{self.model} has at most {len(self.coefficients)} distortion coefficients")
         p = np.zeros(PARAMS)
         p[:4] = self.fx, self.fy, self.cx, self.cy
+        p[:2] *= self._gain(self.distortion)
         p[list(self.slots[: len(self.distortion)])] = self.distortion
         self._derive(p)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # coefficients that no lens has
@@ -54,6 +59,29 @@ class Camera(ReadOnly):
 
     def _limit(self, coefficients: tuple[float, ...]) -> float:
         return 0.0
+
+    @classmethod
+    def _gain(cls, distortion: tuple[float, ...]) -> float:
+        """The focal length of the model's publication over that of the centre."""
+        return 1.0
+
+    @classmethod
+    def published(
+        cls, width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...] = ()
+    ) -> Self:
+        """The camera with focal lengths as the model's publication and other programs have them.
+
+        Raises:
+            ZeroDivisionError: coefficients of no lens.
+        """
+        gain = cls._gain(distortion)
+        return cls(width, height, fx / gain, fy / gain, cx, cy, distortion)
+
+    @property
+    def published_focal(self) -> tuple[float, float]:
+        """(fx, fy) as `published` takes them."""
+        gain = self._gain(self.distortion)
+        return self.fx * gain, self.fy * gain
 
     def _derive(self, p: F64) -> None:
         """Fill in parameters that follow from the coefficients."""
@@ -187,6 +215,29 @@ class Tilted(RadTan):
     coefficients: ClassVar[tuple[str, ...]] = (*RadTan.coefficients, "s1", "s2", "s3", "s4", "tau_x", "tau_y")
     slots: ClassVar[tuple[int, ...]] = (*RadTan.slots, *range(MORE, MORE + 6))
 
+    @classmethod
+    def _gain(cls, distortion: tuple[float, ...]) -> float:
+        """The focal length of the model's publication over that of the centre."""
+        return 1.0
+
+    @classmethod
+    def published(
+        cls, width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...] = ()
+    ) -> Self:
+        """The camera with focal lengths as the model's publication and other programs have them.
+
+        Raises:
+            ZeroDivisionError: coefficients of no lens.
+        """
+        gain = cls._gain(distortion)
+        return cls(width, height, fx / gain, fy / gain, cx, cy, distortion)
+
+    @property
+    def published_focal(self) -> tuple[float, float]:
+        """(fx, fy) as `published` takes them."""
+        gain = self._gain(self.distortion)
+        return self.fx * gain, self.fy * gain
+
     def _derive(self, p: F64) -> None:
         p[TILT : TILT + 9] = _tilt(*p[MORE + 4 : MORE + 6].tolist()).ravel()
 
@@ -203,6 +254,11 @@ class Fov(Camera):
     coefficients: ClassVar[tuple[str, ...]] = ("w",)
     slots: ClassVar[tuple[int, ...]] = (MORE,)
 
+    @classmethod
+    def _gain(cls, distortion: tuple[float, ...]) -> float:
+        w = distortion[0] if distortion else 0.0
+        return w / (2 * float(np.tan(0.5 * w))) if w else 1.0
+
     def impossible(self) -> str:
         return "" if 0 < self.params[MORE] < np.pi else f"w {self.params[MORE]:g}"
 
@@ -215,6 +271,10 @@ class Mei(Camera):
     model_id: ClassVar[int] = lens_kernels.MEI
     coefficients: ClassVar[tuple[str, ...]] = ("xi", "k1", "k2", "p1", "p2")
     slots: ClassVar[tuple[int, ...]] = (MORE, 4, 5, 6, 7)
+
+    @classmethod
+    def _gain(cls, distortion: tuple[float, ...]) -> float:
+        return 1.0 + distortion[0] if distortion else 1.0
 
     def _limit(self, coefficients: tuple[float, ...]) -> float:
         return _growing_radius(coefficients)
@@ -231,6 +291,10 @@ class DoubleSphere(Camera):
     model_id: ClassVar[int] = lens_kernels.DOUBLE_SPHERE
     coefficients: ClassVar[tuple[str, ...]] = ("xi", "alpha")
     slots: ClassVar[tuple[int, ...]] = (MORE, MORE + 1)
+
+    @classmethod
+    def _gain(cls, distortion: tuple[float, ...]) -> float:
+        return 1.0 + distortion[0] if distortion else 1.0
 
     def impossible(self) -> str:
         xi, alpha = self.params[MORE : MORE + 2].tolist()

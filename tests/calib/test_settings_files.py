@@ -138,6 +138,7 @@ def test_vins_fusion_with_its_camera_files(tmp_path: Path) -> None:
     rig = of_text(tmp_path, text)
     assert recognise(tmp_path / "settings.yaml") == "vins"
     assert isinstance(rig.left, Mei) and rig.left.distortion == (1.9, -0.01, 0.02, 0.001, -0.002)
+    assert rig.left.published_focal == pytest.approx((763.5, 762.6))
     assert rig.right is not None and rig.right.distortion[0] == 2.0
     np.testing.assert_allclose(rig.left_T_right[:3, 3], [0.11, 0, 0], atol=1e-12)
     assert rig.imu is not None and rig.imu.offset_s == 0.004
@@ -201,7 +202,7 @@ def test_kalibrs_other_models(
     camera = f"  camera_model: {model}\n  intrinsics: [{before}458.6, 457.2, 367.2, 248.3]\n"
     camera += f"  distortion_model: {lens}\n  distortion_coeffs: {after}\n"
     rig = of_text(tmp_path, chain(camera, "T_cam_imu"))
-    assert rig.left.distortion == distortion and rig.left.fx == 458.6
+    assert rig.left.distortion == distortion and rig.left.published_focal == pytest.approx((458.6, 457.2))
     if model == "pinhole":
         assert isinstance(rig.left, Fov)
 

@@ -33,12 +33,12 @@ TUM_VI = KannalaBrandt(1024, 1024, 380.81, 380.81, 510.29, 514.33, (0.01017, -0.
 WIDE = Epipolar(900, 800, 290.0, 291.0, 449.5, 399.5)
 OAK = (0.32, -0.06, -3.7e-05, 7.6e-05, -0.0023, 0.654, -0.034, -0.009, 0.0011, -0.0004, 0.0007, 0.0002, 0.003, -0.001)
 TILTED = Tilted(1280, 800, 577.8, 577.9, 627.2, 410.3, OAK)
-FOV = Fov(640, 480, 330.0, 332.0, 320.5, 238.0, (0.93,))
+FOV = Fov.published(640, 480, 330.0, 332.0, 320.5, 238.0, (0.93,))
 # Kalibr's omni and its kin on TUM VI and T265 (Usenko et al., 3DV 2018, tables)
-MEI = Mei(752, 480, 900.0, 899.0, 370.0, 240.0, (0.95, -0.13, 0.07, 1e-3, -5e-4))
-MEI_WIDE = Mei(1024, 1024, 760.0, 761.0, 510.0, 514.0, (1.8, -0.02, 0.03, 2e-4, 1e-4))
-DS = DoubleSphere(1024, 1024, 313.2, 313.2, 638.7, 514.4, (-0.1735, 0.5929))
-DS_NARROW = DoubleSphere(640, 480, 320.0, 321.0, 320.0, 240.0, (0.3, 0.4))
+MEI = Mei.published(752, 480, 900.0, 899.0, 370.0, 240.0, (0.95, -0.13, 0.07, 1e-3, -5e-4))
+MEI_WIDE = Mei.published(1024, 1024, 760.0, 761.0, 510.0, 514.0, (1.8, -0.02, 0.03, 2e-4, 1e-4))
+DS = DoubleSphere.published(1024, 1024, 313.2, 313.2, 638.7, 514.4, (-0.1735, 0.5929))
+DS_NARROW = DoubleSphere.published(640, 480, 320.0, 321.0, 320.0, 240.0, (0.3, 0.4))
 EUCM = Eucm(1024, 1024, 380.0, 380.0, 510.3, 514.3, (0.63, 1.04))
 CAMERAS = {
     "tilted": TILTED,
@@ -195,7 +195,7 @@ def wide_rays(camera: Camera) -> np.ndarray:
 
 def plane(camera: Camera, points: np.ndarray) -> np.ndarray:
     """(N, 2) pixels without focal length and principal point."""
-    return (camera.project(points) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    return (camera.project(points) - [camera.cx, camera.cy]) / camera.published_focal
 
 
 def test_wide_models_are_the_published_formulas() -> None:
@@ -284,6 +284,16 @@ def test_the_optical_axis_is_exact() -> None:
         np.testing.assert_allclose(camera.unproject(np.array([camera.cx, camera.cy])), [0, 0, 1], atol=1e-12)
         _, jac = camera.project_jacobian(np.array([[0.0, 0.0, 2.0], [1e-8, 1e-8, 2.0]]))
         np.testing.assert_allclose(jac[0], jac[1], atol=1e-5)
+
+
+@ALL
+def test_the_focal_length_is_that_of_the_centre(camera: Camera) -> None:
+    """Pixels per radian, which what follows images relies on."""
+    a = 1e-6
+    for axis, focal in ((0, camera.fx), (1, camera.fy)):
+        ray = np.array([0.0, 0.0, 1.0])
+        ray[axis] = a
+        assert (camera.project(ray)[axis] - [camera.cx, camera.cy][axis]) / a == pytest.approx(focal, rel=2e-3)
 
 
 def test_epipolar_rows_are_epipolar_planes() -> None:
