@@ -38,6 +38,14 @@ MOST_MB = 600  # of a command that reads a hostile file
 HANG_S = 300.0  # by the clock: the computer may be busy, and a command has fifty seconds of processor time
 BEARER = "Bearer "
 
+WRITER = """
+import sys
+from pathlib import Path
+from stereo_sfm.log.writer import LogWriter
+with LogWriter(Path(sys.argv[1])):
+    sys.stdin.read()
+"""  # another recording, until its input ends
+
 Outcome = tuple[str, bool]  # what happened, whether the door is closed
 
 
@@ -230,13 +238,14 @@ def a_map_over_recordings(t: Target) -> Outcome:
 def two_writers(t: Target) -> Outcome:
     """record --overwrite into a file that is being recorded"""
     file, demo = t.folder / "drive.mcap", ROOT / "recordings" / "demo.mcap"
-    command = [sys.executable, "-m", "stereo_sfm.cli", "record", str(demo), "-q", "--overwrite", "-o", str(file)]
-    first = subprocess.Popen([*command, "--realtime"], env=_environment(t.folder), stderr=subprocess.PIPE, text=True)
+    first = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(file)], env=_environment(t.folder), stdin=subprocess.PIPE
+    )
     while not file.exists() and first.poll() is None:
         time.sleep(0.01)
+    command = [sys.executable, "-m", "stereo_sfm.cli", "record", str(demo), "-q", "--overwrite", "-o", str(file)]
     second = subprocess.run(command, env=_environment(t.folder), capture_output=True, text=True)
-    first.terminate()
-    first.wait(30)
+    first.communicate()
     said = second.stderr.strip().splitlines()[-1:] or [""]
     return f"exit code {second.returncode}: {said[0][-70:]}", second.returncode == 2 and "is writing" in said[0]
 
