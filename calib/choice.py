@@ -97,7 +97,7 @@ class Estimate:
         return float(self._gaussian(np.sqrt(self.value @ np.linalg.solve(self.covariance, self.value))))
 
     def _gaussian(self, deviations: F64) -> F64:
-        """Of Student's distribution as deviations of a Gaussian of the same probability (Wallace, Biometrika 46, 1959)."""
+        """Of Student's distribution as those of a Gaussian of the same probability (Wallace, Biometrika 46, 1959)."""
         if np.isinf(self.freedom):
             return deviations
         return np.sqrt(self.freedom * np.log1p(deviations**2 / self.freedom))

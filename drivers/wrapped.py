@@ -49,8 +49,8 @@ class WrappedSource:
     @property
     def given_rig(self) -> Rig:
         """The calibration before a start check corrected it."""
-        known = self.start_check is not None and isinstance(self.source, WrappedSource)
-        return self.source.given_rig if known else self.rig
+        known = self.start_check is not None
+        return self.source.given_rig if known and isinstance(self.source, WrappedSource) else self.rig
 
     def stamps(self) -> Stamps | None:
         """The stamps of the frames passed on: unknown in advance, unless a subclass knows them."""

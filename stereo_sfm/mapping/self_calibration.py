@@ -34,6 +34,7 @@ from stereo_sfm.mapping.rig_course import Scatter, constant, steady, with_step
 from stereo_sfm.mapping.rig_window import EarlierRig, RigWindow, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
+OF_ROTATION = np.arange(RIG_TERMS) < 3  # of the right camera
 OF_LENSES = slice(5, 8)  # focal ratio and decentering
 KEYFRAMES = 4  # of one window
 MIN_KEYFRAMES = 3  # of the last window
@@ -226,7 +227,7 @@ class SelfCalibration:
         """
         halves = halves or (windows[::2], windows[1::2] or windows)  # one window: what a step has left
         basis = self._basis(windows)
-        kept = np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self.terms))
+        kept = np.asarray(np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self.terms)), float)
         courses = [] if drift else [constant(part, self._expected).at([1.0]) for part in (windows, *halves)]
         ignored = self._taken_back | (len(windows) < INTRODUCED)
         found = drift.at_the_end if drift else courses
@@ -243,7 +244,7 @@ class SelfCalibration:
             self._taken_back, self._corrected = self._taken_back | hunting, self._corrected & ~hunting
             return self._change(windows, drift, refined_sigmas, halves)
         value = np.asarray(np.linalg.solve(basis, choice.value), float) + back
-        covariance = whole.by(np.linalg.inv(basis)).covariance
+        covariance = whole.by(np.asarray(np.linalg.inv(basis), float)).covariance
         return _Change(value, choice.sigma, covariance, choice.written) if value.any() else None
 
     def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
@@ -263,10 +264,13 @@ class SelfCalibration:
         return bool(gains.mean() > HELPING_SIGMAS * gains.std() / np.sqrt(len(gains) - 1))
 
     def _turned(self, across: RigWindow | None) -> _Change | None:
-        """A change of the current terms by a knock, which a window across it shows; None: it shows none."""
+        """A rotation of the right camera, which a window across it shows; None: it shows none.
+
+        Few keyframes tell other terms from it less well than the rows of the next windows do.
+        """
         if across is None:
             return None
-        whole = self._beyond(self.terms, constant([across], self._expected).at([1.0]))
+        whole = self._beyond(self.terms, constant([across], self._expected).at([1.0])).ignoring(~OF_ROTATION)
         choice = choose(whole, [whole], self._rig.readout_s > 0, SIGMAS)
         return _Change(choice.value, choice.sigma, whole.covariance, choice.written) if choice.written.any() else None
 
