@@ -73,6 +73,7 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: Sca
     vectors = np.stack([w.information.vector for w in windows])
     axes = np.einsum("nk,ab->nakb", columns, np.eye(RIG_TERMS)).reshape(count, RIG_TERMS, -1)
     scatter, known = expected.covariance, expected.windows
+    value, covariance, error = np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
     for _ in range(ITERATIONS):
         own = np.linalg.inv(matrices + np.linalg.inv(scatter))  # covariance of a window's own error
         kept = np.eye(RIG_TERMS) - matrices @ own
@@ -87,9 +88,8 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: Sca
     size = kinds * RIG_TERMS
     grown = 1 + 2 * alike / (1 - alike) * (1 - 1 / count)  # of a mean of alike errors
     shown = Scatter(scatter, known + count)
-    return Course(
-        value[:size].reshape(kinds, RIG_TERMS), grown * covariance[:size, :size], shown, known + count - kinds
-    )
+    terms = np.asarray(value[:size], float).reshape(kinds, RIG_TERMS)
+    return Course(terms, grown * covariance[:size, :size], shown, known + count - kinds)
 
 
 def _alike(error: F64, scatter: F64) -> float:

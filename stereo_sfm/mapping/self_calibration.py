@@ -226,7 +226,7 @@ class SelfCalibration:
         """
         halves = halves or (windows[::2], windows[1::2] or windows)  # one window: what a step has left
         basis = self._basis(windows)
-        kept = np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self.terms))
+        kept = np.asarray(np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self.terms)), float)
         courses = [] if drift else [constant(part, self._expected).at([1.0]) for part in (windows, *halves)]
         ignored = self._taken_back | (len(windows) < INTRODUCED)
         found = drift.at_the_end if drift else courses
@@ -243,7 +243,7 @@ class SelfCalibration:
             self._taken_back, self._corrected = self._taken_back | hunting, self._corrected & ~hunting
             return self._change(windows, drift, refined_sigmas, halves)
         value = np.asarray(np.linalg.solve(basis, choice.value), float) + back
-        covariance = whole.by(np.linalg.inv(basis)).covariance
+        covariance = whole.by(np.asarray(np.linalg.inv(basis), float)).covariance
         return _Change(value, choice.sigma, covariance, choice.written) if value.any() else None
 
     def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
@@ -254,7 +254,7 @@ class SelfCalibration:
 
         A window's gain is over its standard deviation: windows know unequally much.
         """
-        changes = [np.linalg.solve(basis, value) + back for value in values]
+        changes = [np.asarray(np.linalg.solve(basis, value), float) + back for value in values]
         gains = np.array([
             w.information.gain(self.terms, change)
             for change, other in zip(changes, halves[::-1], strict=True)
