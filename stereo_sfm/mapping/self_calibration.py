@@ -255,7 +255,7 @@ class SelfCalibration:
 
         A window's gain is over its standard deviation: windows know unequally much.
         """
-        changes = [np.linalg.solve(basis, value) + back for value in values]
+        changes = [np.asarray(np.linalg.solve(basis, value), float) + back for value in values]
         gains = np.array([
             w.information.gain(self.terms, change)
             for change, other in zip(changes, halves[::-1], strict=True)

@@ -38,15 +38,15 @@ def deviations(courses: list[Course], column: list[float], true: F64) -> float:
 @pytest.mark.parametrize("alike", [0.0, 0.6])
 def test_stated_deviations_are_those_of_the_scatter(scatter: float, alike: float) -> None:
     """Whatever windows state, and where neighbours share errors."""
-    true: F64 = 4e-4 * np.arange(RIG_TERMS)
+    true = np.linspace(0.0, 28e-4, RIG_TERMS)
     seen = [windows(np.tile(true, (24, 1)), scatter, seed, alike) for seed in range(30)]
     assert 0.5 < deviations([constant(w, EXPECTED) for w in seen], [1.0], true) < 1.6  # without scatter: 5 and more
 
 
 @pytest.mark.parametrize("scatter", [STATED, 5 * STATED])
 def test_the_deviations_of_a_steady_change_are_right(scatter: float) -> None:
-    true: F64 = 4e-4 * np.arange(RIG_TERMS)
-    terms: F64 = np.linspace(0, 1, 24)[:, None] * true
+    true = np.linspace(0.0, 28e-4, RIG_TERMS)
+    terms = np.linspace(0, 1, 24)[:, None] * true
     seen = [windows(terms, scatter, seed) for seed in range(30)]
     assert 0.5 < deviations([steady(w, w, EXPECTED) for w in seen], [0.0, 1.0], true) < 1.3
     assert 0.5 < deviations([steady(w, w, EXPECTED) for w in seen], [1.0, 0.0], true) < 1.3
