@@ -266,13 +266,16 @@ class SelfCalibration:
     def _turned(self, across: RigWindow | None) -> _Change | None:
         """A rotation of the right camera, which a window across it shows; None: it shows none.
 
-        Few keyframes tell other terms from it less well than the rows of the next windows do.
+        Few keyframes tell it from other terms badly: it must be there whatever these are, and beside them.
         """
         if across is None:
             return None
-        whole = self._beyond(self.terms, constant([across], self._expected).at([1.0])).ignoring(~OF_ROTATION)
-        choice = choose(whole, [whole], self._rig.readout_s > 0, SIGMAS)
-        return _Change(choice.value, choice.sigma, whole.covariance, choice.written) if choice.written.any() else None
+        whole = self._beyond(self.terms, constant([across], self._expected).at([1.0]))
+        alone = whole.ignoring(~OF_ROTATION)
+        choice, beside = (choose(e, [e], self._rig.readout_s > 0, SIGMAS) for e in (alone, whole))
+        if not (choice.written & beside.written).any():
+            return None
+        return _Change(choice.value, choice.sigma, alone.covariance, choice.written)
 
     def _knock(self, keyframe: Keyframe) -> Revision | None:
         """The revision of a rotation that the tracker noticed, once a few keyframes confirm it."""
