@@ -166,9 +166,8 @@ def _robot(masks: MaskSearch, rig: Rig) -> list[Finding]:
 def _check(options: CheckOptions) -> None:
     from stereo_sfm.errors import StereoSfmError
 
-    check_counts(
-        {"--windows": options.windows, "--max-frames": options.max_frames, "--search": options.search or DEFAULT_SEARCH}
-    )
+    search = DEFAULT_SEARCH if options.search is None else options.search
+    check_counts({"--windows": options.windows, "--max-frames": options.max_frames, "--search": search})
     if options.correct is not None and options.correct.exists() and not options.overwrite:
         raise StereoSfmError(f"{options.correct} exists: choose another name or give --overwrite")
 

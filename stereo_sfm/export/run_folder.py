@@ -30,6 +30,12 @@ def is_free(folder: Path) -> bool:
     return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
 
 
+def refuse_taken(folder: Path, overwrite: bool) -> None:
+    """Raises StereoSfmError for a folder that is not empty, without `overwrite`."""
+    if not (overwrite or is_free(folder)):
+        raise StereoSfmError(f"{folder} exists: choose another -o, or add --overwrite")
+
+
 def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
     """Create the folder of a new run, or take an empty one, and lock it.
 
@@ -39,8 +45,7 @@ def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
         StereoSfmError: it is not empty, locked by another run, or cannot be created.
     """
     try:
-        if not (overwrite or is_free(folder)):
-            raise StereoSfmError(f"{folder} exists: choose another -o, or add --overwrite")
+        refuse_taken(folder, overwrite)
         folder.mkdir(parents=True, exist_ok=True)
         lock = FolderLock(folder, "choose another -o, or wait for its end")
         discard_files(folder)

@@ -15,7 +15,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener, with_known_start, with_start_check
 from stereo_sfm.drivers.start_checked import RigChanged, StartCheckedSource
 from stereo_sfm.errors import StereoSfmError, require
-from stereo_sfm.export.run_folder import KEPT_MAP, default_folder, discard_files, prepare_folder
+from stereo_sfm.export.run_folder import KEPT_MAP, default_folder, discard_files, prepare_folder, refuse_taken
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, LogEnded, Sink
@@ -90,6 +90,8 @@ class Session:
         return self._folder
 
     def __enter__(self) -> Self:
+        if self._folder is not None:
+            refuse_taken(self._folder, self._overwrite)  # before the source tells of its images
         try:
             with ExitStack() as stack:
                 self._frames = self._enter_inline(stack) if self._wiring.inline else self._enter_processes(stack)

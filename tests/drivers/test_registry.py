@@ -37,7 +37,8 @@ def test_a_driver_describes_itself(kind: str) -> None:
     assert is_dataclass(found.options) and issubclass(found.options, SourceOptions) and found.options.__doc__
     helps = list(described(found.options))
     assert len(helps) == len(fields(found.options)) and all(h.doc for h in helps)
-    assert found.options() == look_up(f"{kind}:{'loop' if kind == 'sim' else ''}").options
+    place = {"sim": "loop", "video": "drive.mp4"}.get(kind, "")
+    assert found.options() == look_up(f"{kind}:{place}").options
 
 
 def test_listing_the_drivers_imports_no_heavy_library() -> None:

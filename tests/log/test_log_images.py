@@ -136,7 +136,7 @@ def test_depth_encodings() -> None:
         (b"\0" * 5, 3, 2, 3, "mono8", "only 5 bytes"),
         (b"\0" * 6, 3, 2, 2, "mono8", "only 6 bytes"),
         (b"", 3, 2, 0, "mono8", "only 0 bytes"),
-        (b"\0" * 6, 3, 2, 3, "nv12", "not supported"),
+        (b"\0" * 6, 3, 2, 3, "rgb565", "not supported"),
     ],
 )
 def test_bad_pixels_are_named(data: bytes, width: int, height: int, step: int, encoding: str, says: str) -> None:

@@ -271,7 +271,7 @@ def test_the_users_number_of_threads_does_not_reach_the_stages(monkeypatch: pyte
 def test_a_source_that_cannot_be_opened_is_one_clear_line() -> None:
 
     with (
-        pytest.raises(StereoSfmError, match="unknown source 'nothing'"),
+        pytest.raises(StereoSfmError, match="no such file or folder: nothing"),
         ProcessRun(SourceChoice("nothing"), CONFIG),
     ):
         pass
