@@ -114,9 +114,11 @@ def _health(report: Health) -> dict[str, float]:
 
 def failure(stats: dict[str, Any]) -> str:
     """Why the run counts as failed (exit code 4), or ''."""
+    checked = stats["start_check"]
     if not stats["tracked"]:
-        checked = stats["start_check"]
         return "tracking never initialised" + (f": {checked['text']}" if checked else "")
+    if checked and checked["shown"] and not checked["corrected"]:
+        return f"the first images contradict the calibration: {checked['text']}"
     if stats["lost_percent"] > stats["max_lost_percent"]:
         dropped = stats["dropped_by_capture"]
         why = f", {thousands(dropped)} of them dropped by capture: the stages are too slow" if dropped else ""

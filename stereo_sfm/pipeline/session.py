@@ -24,6 +24,7 @@ from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
+from stereo_sfm.pipeline.threads import limited_threads
 from stereo_sfm.pipeline.viewer import ViewerOptions
 from stereo_sfm.types import Dropped, Frame, StartCheck
 from stereo_sfm.viz.server import LOOPBACK
@@ -195,9 +196,10 @@ class Session:
         from stereo_sfm.pipeline.logger import LogSink
 
         self._compilation = stack.enter_context(listening(self._compiling))
-        source = stack.enter_context(self._opener())
-        if isinstance(source, StartCheckedSource):
-            source.look()  # a camera's images as well: nothing in this process makes them wait
+        with limited_threads(self._config.pipeline.threads):  # the start check gives the bits of the processes' one
+            source = stack.enter_context(self._opener())
+            if isinstance(source, StartCheckedSource):
+                source.look()  # a camera's images as well: nothing in this process makes them wait
         self.info = SourceInfo.of(source)
         folder = self._name_folder(source.name)
         self._prepare()

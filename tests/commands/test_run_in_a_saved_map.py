@@ -69,7 +69,7 @@ def second_sequence(tmp_path: Path, store: Path, *options: str) -> int:
 def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved = load_map(store)
     described = len(np.unique(saved.snapshot.corner_kf))  # not where the view had hardly changed
-    assert 7 <= described <= len(saved) >= 10
+    assert 7 <= described <= len(saved) >= 9
     assert main(["map", "info", str(store)]) == 0
     count = len(saved.snapshot.corner_kf)
     assert f"{count} corners for place recognition in {described} keyframes" in capsys.readouterr().out

@@ -268,7 +268,7 @@ def _sign(folder: Path) -> None:
     """Make the checksums of a map those of its files."""
     head = json.loads((folder / "map.json").read_text())
     for name in head["sha256"]:
-        path = folder / ("rig.yaml" if name == "rig" else f"{name}.npz")
+        path = next(folder / f"{name}{end}" for end in (".npz", ".yaml") if (folder / f"{name}{end}").exists())
         head["sha256"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
     (folder / "map.json").write_text(json.dumps(head))
 
