@@ -21,6 +21,7 @@ from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.types import Frame, StereoImage, TrackState, Trajectory
+from tests.synthetic import pinhole_rig
 
 Change = Callable[[Iterator[StereoImage]], Iterator[StereoImage]]
 CONFIG = load().tracker
@@ -202,3 +203,17 @@ def test_backwards_points_are_kept_as_long_as_forwards() -> None:
     back_at_start = steps[298][0].odom_T_cam[:3, 3] - steps[0][0].odom_T_cam[:3, 3]
     assert keyframes[1] + keyframes[3] < 1.5 * (keyframes[0] + keyframes[2])
     assert np.linalg.norm(back_at_start) < 0.02
+
+
+def test_a_tracker_that_loses_its_second_image_begins_anew_at_once_but_once() -> None:
+    """One image is nothing to wait for; a camera that shakes must not make a submap of every other image."""
+    rng, rig, images = np.random.default_rng(0), pinhole_rig(), list[StereoImage]()
+    for k in range(6):  # ten a second, unrelated to one another
+        wide = cv2.GaussianBlur(rng.integers(0, 256, (480, 660)).astype(np.float32), (0, 0), 2.0)
+        wide = cv2.normalize(wide, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+        left, right = (np.ascontiguousarray(side) for side in (wide[:, :640], wide[:, 16:656]))
+        images.append(StereoImage(frame_id=k, stamp_ns=k * 100_000_000, left=left, right=right))
+    tracker = Tracker(CONFIG, rig)
+    states = [tracker.step(image)[0].state for image in images]
+    ok, lost, begun = TrackState.OK, TrackState.LOST, TrackState.RESTARTED
+    assert states == [ok, lost, begun, lost, lost, lost]

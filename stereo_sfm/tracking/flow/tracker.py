@@ -104,7 +104,8 @@ class Tracker:
         self._pose: F64 = np.eye(4)
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
-        self._begun_ns = 0  # the first image of this submap
+        self._begun_ns = 0  # the first image of this submap, if nothing was lost just before
+        self._begins_anew = False  # because the second image of the submap before was lost
         self._lost = 0  # successive frames
         self._lost_ns = 0  # the last of them
         self._free_s = 0.0  # for which the view has been free without a pose
@@ -351,7 +352,7 @@ class Tracker:
             self._velocity = solution.velocity if self._shutter.active else mean
         if recovered:
             self._velocity = self._recovery.motion.velocity()
-        inlier = solution.inlier & ~tracks.moving
+        inlier, self._begins_anew = solution.inlier & ~tracks.moving, False
         tracks.age = tracks.age + np.int32(1)
         static = static_frames(seconds)
         tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert, static)
@@ -390,7 +391,8 @@ class Tracker:
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
         self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose, self._pose)
-        self._held_ns = self._begun_ns = image.stamp_ns
+        self._held_ns = image.stamp_ns
+        self._begun_ns = -1 if self._begins_anew else image.stamp_ns
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         self._bridging = False
         if self._sensors is not None:
@@ -506,7 +508,8 @@ class Tracker:
             self._free_s = self._free_s + seconds if self._recovery.free else 0.0
             self._covered_s += unseen if self._recovery.free else seconds + unseen
         self._lost_ns = image.stamp_ns
-        begun = self._stamp_ns == self._begun_ns  # one image is nothing to wait for
+        begun = self._stamp_ns == self._begun_ns  # one image is nothing to wait for, but once only
+        self._begins_anew |= begun
         if begun or max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:
             self._pose = expected.odom_T_cam
             self._velocity = self._recovery.motion.velocity_at(image.stamp_ns)
