@@ -16,7 +16,7 @@ CLEARLY, SIGMAS = (
     0.05,
     2.0,
 )  # a switch beats default by more than this share and so many standard errors (of two starts or more)
-CLEARLY_LOST = 0.01  # the same of lost frames, as a share of all
+CLEARLY_LOST = 0.01  # further lost frames, as a share of all, from which a switch is worse
 STEPS_FOUND = 0.9  # share that must be
 BETTER = "BETTER THAN DEFAULT"
 
@@ -41,11 +41,11 @@ def markdown(sequences: Sequence[RealSequence], codes: Sequence[str], labels: Se
 
 
 def _steps(runs: list[Run]) -> list[str]:
-    """Which steps that were put into sequences were found, how late, and how many others were told."""
+    """Which steps that were put into sequences were found, how late, and how many others were reported."""
     if not runs:
         return []
     names = list(dict.fromkeys(r["switch"] for r in runs))
-    heading = "| steps found (others told), s later | "
+    heading = "| steps found (others reported), s later | "
     lines = [heading + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for sequence in dict.fromkeys(r["sequence"] for r in runs):
         cells = [_found(_of(runs, sequence, name)) for name in names]

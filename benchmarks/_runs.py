@@ -27,7 +27,7 @@ def recorded(source: Source, config: Config) -> RunRecord:
 
 
 def recorded_of(spec: str, config: Config, max_frames: int | None = None) -> tuple[RunRecord, Trajectory | None]:
-    """The same of a source by its name, and its ground truth."""
+    """The record of a run on a source given by its name, and its ground truth."""
     with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
         return recorded(source, config), source.ground_truth
 
@@ -35,7 +35,7 @@ def recorded_of(spec: str, config: Config, max_frames: int | None = None) -> tup
 def recorded_together(
     source: Source, configs: Sequence[Config], images: Iterable[StereoImage] | None = None
 ) -> list[RunRecord]:
-    """The same of several runs on each image in turn: a simulated source is rendered once.
+    """The records of several runs on each image in turn: a simulated source is rendered once.
 
     `images`: those to run on instead of all images of the source.
     """

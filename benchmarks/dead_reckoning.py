@@ -2,7 +2,7 @@
 
     python benchmarks/dead_reckoning.py [--seeds 10] [--rest 20]
 
-Before the dark the sensors are told the pose of each image, half a millimetre and a tenth of a milliradian off; nothing
+Before the dark the sensors get the pose of each image, half a millimetre and a tenth of a milliradian off; nothing
 is rendered, so that many seeds take seconds. "error" is that of the pose at the end of the dark, median and
 largest over the seeds, "expected" the median of its own standard deviation. At rest each image is a third of a
 millimetre and a twentieth of a milliradian off, and every second new points are seen from its pose, with that error.

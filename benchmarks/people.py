@@ -3,7 +3,7 @@
 Every kind of encounter of the simulator (`sim:...?encounters=KIND`), for the fisheye and the pinhole pair at 30 and 15
 frames a second, images of the camera's own size (`--half-size`: of half of it, in a fourth of the time), 0.8 m/s. An
 encounter that takes more than 60 % of the view of a camera counts as covering. Of those the table has the number
-recovered in the same submap within 0.5 s of a free view, the median and the largest error of the motion since before,
+recovered in the same submap within 0.5 s of an unobstructed view, the median and largest error of the motion since,
 and the number recovered at a wrong place; those that cover for more than 3 s are counted apart and not judged, but for
 a wrong place. Of the others: lost frames, steps that are wrong by more than 10 mm or 0.2 degrees while the state says
 OK, and the error of the frame poses compared with the same drive without people. Below the table: for each kind, camera

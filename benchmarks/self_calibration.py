@@ -2,7 +2,7 @@
 
     python benchmarks/self_calibration.py                       every camera, seeds 0 to 9: minutes each
     python benchmarks/self_calibration.py --seeds 2 --size 424x400 --camera fisheye
-    python benchmarks/self_calibration.py --what knock drift
+    python benchmarks/self_calibration.py --what step drift
     python benchmarks/self_calibration.py --what residual --seeds 5
 
 Each seed is another store, rendered once and tracked with several calibrations: the true one; right cameras rotated
@@ -44,11 +44,11 @@ from stereo_sfm.types import F64, RIG_TERMS, StereoImage, Trajectory
 Degrees = tuple[float, float, float]  # about the axes of the right camera
 
 CAMERAS = ("fisheye", "pinhole")
-WHAT = ("static", "knock", "drift", "residual")
+WHAT = ("static", "step", "drift", "residual")
 TURNS = ((0.05, 0, 0), (0, 0.05, 0), (0, 0, 0.05), (0, 0.1, 0), (0.2, 0, 0), (0, -0.3, 0), (0, 0, -0.3))
-STILL, KNOCK, DRIFT = (0.0, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.1, 0.0)
+STILL, STEP, DRIFT = (0.0, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.1, 0.0)
 RATE_HZ = 15
-LEFT_DEG, NOTICED_S, ATE, ATE_KNOCK = (0.005, 0.01, 0.005), 5.0, 1.1, 1.5
+LEFT_DEG, NOTICED_S, ATE, ATE_STEP = (0.005, 0.01, 0.005), 5.0, 1.1, 1.5
 # With residual distortion: px, standard deviations and degrees of turns that remain, rigs of each store.
 RESIDUAL_PX, STATED, RESIDUAL_DEG, RESIDUAL_TURNS = 0.5, 2.0, 0.03, (STILL, *TURNS[3:6])
 # What two runs of one store differ by in any case: share of a length, px of a row.
@@ -98,14 +98,14 @@ class Store:
         self._still: list[StereoImage] = []
 
     def images(self, how: str) -> list[StereoImage]:
-        """`how`: still, knock or drift."""
+        """`how`: still, step or drift."""
         count = len(self._source.frame_ids)
         if not self._still:
             self._still = self._render(np.zeros(count), STILL)
         if how == "still":
             return self._still
-        if how == "knock":
-            return self._still[: count // 2] + self._render(np.ones(count - count // 2), KNOCK)
+        if how == "step":
+            return self._still[: count // 2] + self._render(np.ones(count - count // 2), STEP)
         return self._render(np.arange(count) / count, DRIFT)
 
     def row_error_px(self, believed: Rig) -> float:
@@ -165,13 +165,13 @@ def static(name: str, store: Store, every: int, bad: list[str]) -> Result:
 def moving(name: str, store: Store, how: str, base: float, bad: list[str]) -> None:
     """A rig that changes during the run, compared with one that does not (`base`: its ATE in metres)."""
     images, rig, truth = store.images(how), store.rig, store.truth
-    after = turned(rig, KNOCK) if how == "knock" else turned(rig, DRIFT)
+    after = turned(rig, STEP) if how == "step" else turned(rig, DRIFT)
     result, off = measure(images, rig, after, truth), measure(images, rig, after, truth, "off")
     row(how, result, base)
     row(f"{how}, uncorrected", off, base)
-    begin = 0.5 * len(images) / RATE_HZ if how == "knock" else 0.0
-    late = how == "knock" and not begin <= result.noticed_s <= begin + NOTICED_S
-    if late or result.ate_m > ATE_KNOCK * base:
+    begin = 0.5 * len(images) / RATE_HZ if how == "step" else 0.0
+    late = how == "step" and not begin <= result.noticed_s <= begin + NOTICED_S
+    if late or result.ate_m > ATE_STEP * base:
         bad.append(f"{name}: {how}")
 
 

@@ -94,7 +94,7 @@ def judge_wheel_noise(noise: float, known: Wheel) -> Finding:
 
 
 def judge_noise(noise: F64, known: Imu) -> Finding:
-    """Whether densities (2,) found at rest are what a calibration says. A filter that is told too little trusts the
+    """Whether densities (2,) found at rest are what a calibration says. A filter with too small a density trusts the
     sensor too much; too much does no harm."""
     if not np.isfinite(noise).any():
         return Finding("IMU noise", 0, "the camera does not stand for a second: not shown", judged=False)

@@ -87,9 +87,9 @@ class TrackerConfig:
     keyframe_share: float = number(0.75, 0, 1, "New keyframe when a smaller share of the last one's points is left")
     keyframe_max_frames: int = number(30, 1, 100_000, "Frames that a keyframe represents at most")
     inertial: bool = switch(
-        True, "Use the IMU, where the source has one: prediction, and poses where images show nothing"
+        True, "Use the IMU, if the source has one, to predict poses and to bridge images that show nothing"
     )
-    wheels: bool = switch(True, "Use the wheel odometry, where the source has one, as the IMU")
+    wheels: bool = switch(True, "Use the wheel odometry, if the source has one, in the same way")
     calibrate_sensors: bool = switch(
         False,
         "Estimate time offset and rotation of the IMU, and radii, track and pose of the wheels, while driving",
@@ -215,7 +215,7 @@ class MapperConfig:
     )
     crowd_keyframes: int = number(5, 1, 10_000, "Keyframes kept of one view")
     repeated_keyframes: int = number(
-        300, 0, 1_000_000, "Keyframes kept of views of earlier visits, besides those; others go when passed"
+        300, 0, 1_000_000, "Keyframes of earlier visits that are kept besides; further ones are removed once passed"
     )
     full_ba_growth: float = number(1.15, 1, 1e6, "Full bundle adjustment when the map has grown by this factor")
     full_ba_lag_keyframes: int = number(
@@ -259,9 +259,9 @@ class LoopConfig:
         400, 1, 20_000, "Corners for recognising a keyframe, since tracked points are seldom detected again"
     )
     side_corners: int = number(
-        600, 0, 20_000, "Corners in views that face the shelves, by which a place is known in both directions; 0: none"
+        600, 0, 20_000, "Corners in views that face the shelves, to recognise a place in both directions; 0: none"
     )
-    side_inliers: int = number(45, 1, 1_000_000, "Such corners that must agree for a loop across directions")
+    side_inliers: int = number(45, 1, 1_000_000, "Corners of these views that must agree for a loop across directions")
     side_cells: int = number(6, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain them")
     proximity: bool = switch(True, "Verify also the old keyframe that should be nearest by odometry")
     pause: int = number(10, 0, 1_000_000, "Keyframes after an accepted loop without a search for another")

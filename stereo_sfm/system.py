@@ -76,7 +76,7 @@ class Tracker:
             depth: (H, W) metres (RGB-D).
             imu: samples since the image before; used where the calibration has `imu`. What is doubled, out of order,
                 not a number or in other units is left out, each with one line.
-            wheel: the same of wheels.
+            wheel: samples of the wheels since then, likewise.
 
         Raises:
             StereoSfmError: not an image of this rig.

@@ -88,7 +88,7 @@ def write_colmap(rig: Rig, folder: Path) -> None:
 
 
 def write_colmap_rigs(rigs: Sequence[Rig], folder: Path) -> None:
-    """The same of several rigs, numbered from 1 in this order; their cameras follow each other, left before right."""
+    """Write several rigs, numbered from 1 in this order; their cameras follow each other, left before right."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras: list[Camera] = []
     entries = ["# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [QW..TZ])"]

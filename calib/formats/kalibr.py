@@ -70,7 +70,7 @@ def _cam_T_imu(camera: dict[str, Any]) -> F64 | None:
 
 
 def _left_T_right(data: dict[str, Any], pair: tuple[int, int]) -> F64:
-    """(4, 4) by the chain of T_cn_cnm1 between the two cameras, else by the poses of both to the IMU."""
+    """(4, 4) by the product of T_cn_cnm1 between the two cameras, else by the poses of both to the IMU."""
     first, last = sorted(pair)
     between = [data.get(f"cam{k}", {}) for k in range(first + 1, last + 1)]
     if all("T_cn_cnm1" in camera for camera in between):

@@ -18,7 +18,7 @@ class ImagesOptions(SourceOptions):
     """Options of `images:FOLDER`."""
 
     left: str = option("", "folder of the left images, or a pattern of its files, if the names are unusual")
-    right: str = option("", "the same of the right images")
+    right: str = option("", "folder of the right images, or a pattern of its files, if the names are unusual")
     fps: float | None = option(
         None, "frames a second, where neither names nor times.txt tell the stamps (30)", low=1e-3, high=1e5
     )

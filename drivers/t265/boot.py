@@ -23,7 +23,7 @@ _CHUNK = 256 * 1024
 def boot(device: UsbDevice, firmware: Firmware, backend: Any, timing: Timing) -> UsbDevice:
     """Send the firmware to one camera and return the running camera.
 
-    The bus and address change, so it is identified as a new running camera, preferably at the same chain of ports.
+    The bus and address change, so it is identified as a new running camera, preferably at the same USB ports.
 
     Raises:
         NoPermission, Busy, BootFailed.

@@ -19,7 +19,7 @@ ADVICE = {
     "dark": "images were dark: use more light or a longer exposure",
     "too_few_points": "too few points could be tracked: check the images (blur, bare walls, a covered lens)",
     "no_consensus": "points did not agree on one motion: people or carts in view, or a wrong calibration",
-    "not_found": "the camera saw nothing that it knew: free its view, or drive back to where it was tracked",
+    "not_found": "the camera saw no known place: clear its view, or drive back to where tracking last worked",
 }
 SHOWN_ROWS = 50  # of a table
 # Why a loop candidate was rejected (`LoopResult.rejected`), as in docs/glossary.md.
@@ -28,7 +28,7 @@ REJECTIONS = {
     "no_pose": "the matches fit no pose",
     "too_few_inliers": "too few matches fit one pose",
     "not_spread": "the inliers cover too small a part of the image",
-    "same_direction": "views to the side fit, but other corners do not, though the camera looks the same way",
+    "same_direction": "views to the side fit, but other corners do not, though the camera looks in the same direction",
     "against_odometry": "the pose contradicts the odometry by more than drift can explain",
     "out_of_reach": "the camera cannot have moved there while tracking was lost",
     "better_elsewhere": "another candidate of the same keyframe has many more inliers",
@@ -84,7 +84,7 @@ def write_report(
     ]
     lines += [
         "the time from the arrival of an image to its pose. The images of a recording are read ahead and wait in the",
-        "queues, so that it says nothing about the speed there; it is not in the plot below.",
+        "queues: there it is no measure of speed, and the plot below omits it.",
     ]
     with (folder / "report.md").open("w", encoding="utf-8") as report:
         report.write("\n".join([*lines, "", _glossary(folder), ""]))

@@ -21,7 +21,7 @@ class TwistMotion:
     rotation: F64  # (3, 3) i_R_j
     position: F64  # (3,) m
     rotation_by_rate: F64  # (3, 3) derivative of the rotation's right tangent by a constant error of the rate
-    position_by_rate: F64  # (3, 3) the same of the position
+    position_by_rate: F64  # (3, 3) derivative of the position by that error
     covariance: F64  # (6, 6) of position (axes at i) and rotation (right tangent), by white noise alone
     way: float  # m along the path
 

@@ -196,7 +196,7 @@ class Session:
         log.info("the saved map was recognised: poses are in its frame")
 
     def _compiling(self, _: Compiling) -> None:
-        """The first start after an installation takes up to minutes: a person is told why."""
+        """The first start after an installation takes up to minutes: the state says why."""
         if self._facts.starting and self._facts.starting != COMPILING:
             self._facts.starting = COMPILING
             log.info("%s", COMPILING)

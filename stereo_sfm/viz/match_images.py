@@ -32,7 +32,7 @@ def draw_matches(left: U8, right: U8, uv_left: F64, uv_right: F64, others: F64, 
         cv2.circle(canvas, (u + width, v), 2, _UNMATCHED, 1, cv2.LINE_AA)
     step = max(1, -(-len(uv_left) // _MAX_LINES))
     a, b = np.rint(uv_left[::step]).astype(int), np.rint(uv_right[::step]).astype(int)
-    # Colour by height in the canvas, so that neighbouring lines can be told apart.
+    # Colour by height in the canvas, so that neighbouring lines can be distinguished.
     shade = np.clip(255 * a[:, 1:2] / max(left.shape[0], 1), 0, 255).astype(np.uint8)
     colours = cv2.applyColorMap(shade, cv2.COLORMAP_TURBO).reshape(-1, 3)
     for (u0, v0), (u1, v1), colour in zip(a.tolist(), b.tolist(), colours.tolist(), strict=True):

@@ -227,7 +227,7 @@ class RerunSink:
         a, b = a[some], b[some]
         shift = np.array([before.shape[1], 0.0])
         ends = np.stack([keyframe.uv_left[a], obs.uv_left[b] + shift], 1)
-        colors = turbo(ends[:, 0, 1], 0.0, float(before.shape[0]))  # by height, so that neighbours can be told apart
+        colors = turbo(ends[:, 0, 1], 0.0, float(before.shape[0]))  # by height, so that neighbours can be distinguished
         self._rec.log("matches/image", _jpeg(np.hstack([before, now])))
         self._rec.log("matches/lines", rr.LineStrips2D(strips(ends), colors=colors, radii=rr.Radius.ui_points(0.6)))
 

@@ -197,7 +197,7 @@ def page_link(config: RobotConfig) -> str:
 
 
 def _make(path: Path) -> None:
-    """A new token, for this user's eyes only. Of two processes that do this at once, one wins."""
+    """A new token that only this user can read. Of two processes that do this at once, one wins."""
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)

@@ -22,7 +22,7 @@ from stereo_sfm.service.publisher import COMMANDS, ServiceClient
 
 SERVICES = ("status", "save_map", "load_map", "reset", "relocalize", "start_recording", "stop_recording", "mark")
 BACKLOG = 256  # messages that wait for one client; the oldest is dropped
-ANSWERS = 64  # the same of answers to its requests, beyond which no more requests are read
+ANSWERS = 64  # answers that wait for one client, beyond which no more of its requests are read
 CALLS = 4  # of one client at once
 REPLY_S = 30.0
 REQUEST_BYTES = 1 << 14

@@ -57,7 +57,7 @@ class PageConfig:
 class SecurityConfig:
     """Who may connect."""
 
-    token_file: str = path("File with the token; empty: one is made, for this user's eyes only")
+    token_file: str = path("File with the token; empty: one is made that only this user can read")
     tls_cert: str = path("Certificate (PEM), for encrypted connections")
     tls_key: str = path("Its key")
     auth: str = word("token", ("token", "none"), "What clients need; none lets in every user of this computer")
