@@ -23,6 +23,7 @@ def main(args: list[str]) -> int:
             print(f"  {name:20} {text.partition(chr(10))[0]}")
         return 0
     split = args.index("--") if "--" in args else len(args)
+    known.sort(key=lambda name: name == "results")  # made from what the others wrote
     names, passed_on = args[:split] or known, args[split + 1 :]
     unknown = [name for name in names if name not in known]
     if unknown:

@@ -17,6 +17,7 @@ from _sequences import data_root, one_thread
 one_thread()
 
 import numpy as np
+from _figures import Figure, write
 from _runs import ODOMETRY_ONLY, recorded_together
 
 from stereo_sfm import config as configuration
@@ -64,7 +65,9 @@ def main() -> None:
     parser.add_argument("sequence", nargs="*", help="sources; default: the ten stores and the store walk")
     parser.add_argument("--odometry", action="store_true", help="only without mapping and loop closing")
     parser.add_argument("--max-frames", type=int, default=FRAMES)
+    parser.add_argument("--write", action="store_true", help="keep the figures for the page of results")
     args = parser.parse_args()
+    figures: list[Figure] = []
     root = data_root()
     walk = [str(root / "store_walk")] if root is not None and (root / "store_walk").is_dir() else []
     found: dict[str, list[float]] = {}
@@ -72,7 +75,12 @@ def main() -> None:
     for spec in args.sequence or [*STORES, *walk]:
         for name, scale, ate, path in rows_of(spec, args.odometry, args.max_frames):
             found.setdefault(name, []).append(abs(scale))
+            short = spec if spec not in walk else "store_walk"
+            figures.append(Figure(f"`{short}`", f"{name}, scale error", scale, "%"))
+            figures.append(Figure(f"`{short}`", f"{name}, ATE of the path", ate, "%"))
             print(f"| {spec} | {name} | {path:.1f} m | {scale:+.3f} % | {ate:.3f} % |", flush=True)
+    if args.write:
+        print(write("scale", "Scale in ten simulated stores", figures))
     for name, scales in found.items():
         print(f"| mean, largest | {name} | | {np.mean(scales):.3f} %, {np.max(scales):.3f} % | |")
 

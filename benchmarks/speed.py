@@ -19,6 +19,7 @@ one_thread()
 
 import cv2
 import numpy as np
+from _figures import Figure, write
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.source import open_source
@@ -44,8 +45,8 @@ def orb_ms(orb: cv2.ORB, image: StereoImage) -> float:
     return (time.perf_counter() - start) * 1e3
 
 
-def measure(name: str, spec: str, frames: int) -> str | None:
-    """One table row; None for a sequence that is too short."""
+def measure(name: str, spec: str, frames: int) -> tuple[str, list[Figure]] | None:
+    """One table row and its figures; None for a sequence that is too short."""
     orb = cv2.ORB_create(1000)  # pyright: ignore[reportAttributeAccessIssue]
     step: list[float] = []
     extraction: list[float] = []
@@ -75,11 +76,20 @@ def measure(name: str, spec: str, frames: int) -> str | None:
         width, height = source.rig.left.size
     p50, p95 = np.percentile(step, [50, 95])
     base = float(np.median(extraction))
-    return (
+    title = f"{name}, {width}×{height}"
+    figures = [
+        Figure(title, "step, median", p50, "ms"),
+        Figure(title, "over ORB on both images", p50 / base),
+        Figure(title, "95th percentile over ORB's", p95 / base),
+        Figure(title, "points", float(np.median(points))),
+        Figure(title, "a keyframe's points, after the pose", float(np.median(description or [0.0])), "ms"),
+    ]
+    row = (
         f"| {name} | {width}×{height} | {len(step)} | {p50:.1f} ms | {p95:.1f} ms | {base:.1f} ms "
         f"| {p50 / base:.2f} | {p95 / base:.2f} | {int(np.median(points))} "
         f"| {np.median(description) if description else 0.0:.1f} ms |"
     )
+    return row, figures
 
 
 def main() -> None:
@@ -87,12 +97,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("source", nargs="*", help="folder names of the data root, or sources")
     parser.add_argument("--frames", type=int, default=150)
+    parser.add_argument("--write", action="store_true", help="keep the figures for the page of results")
     args = parser.parse_args()
+    figures: list[Figure] = []
     print("\n".join(HEADING))
     for name, spec in sequences(args.source):
-        row = measure(name, spec, args.frames)
-        if row is not None:
-            print(row, flush=True)
+        found = measure(name, spec, args.frames)
+        if found is not None:
+            print(found[0], flush=True)
+            figures += found[1]
+    if args.write:
+        print(write("speed", "Time of a tracking step", figures))
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from _sequences import one_thread, sequences
 one_thread()
 
 import numpy as np
+from _figures import Figure, write
 from _runs import ODOMETRY_ONLY, recorded_of
 
 from stereo_sfm import config as configuration
@@ -49,17 +50,24 @@ def main() -> None:
     parser.add_argument(
         "sequence", nargs="*", default=list(SEQUENCES), help="folder names of the data root, or sources"
     )
+    parser.add_argument("--write", action="store_true", help="keep the figures for the page of results")
     args = parser.parse_args()
+    figures: list[Figure] = []
     print("| sequence | trajectory | ATE SE(3) | ± | ATE Sim(3) | ± |")
     print("|---|---|---|---|---|---|")
     for name, spec in sequences(args.sequence):
         for kind, settings in (("odometry alone", ODOMETRY_ONLY), ("map", ())):
             found = errors(spec, settings)
             (se3, sim3), (se3_sd, sim3_sd) = found.mean(0), found.std(0)
+            short = kind.split()[0]
+            figures.append(Figure(name, f"{short}, ATE SE(3)", 1e3 * se3, "mm", 1e3 * se3_sd, len(found)))
+            figures.append(Figure(name, f"{short}, ATE Sim(3)", 1e3 * sim3, "mm", 1e3 * sim3_sd, len(found)))
             print(
                 f"| {name} | {kind} | {length(se3)} | {length(se3_sd)} | {length(sim3)} | {length(sim3_sd)} |",
                 flush=True,
             )
+    if args.write:
+        print(write("spread", "Accuracy on public sequences", figures))
 
 
 if __name__ == "__main__":
