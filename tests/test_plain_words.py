@@ -19,7 +19,7 @@ CODE = ("stereo_sfm", "drivers", "calib", "benchmarks", "examples", "recordings"
 # Rooms whose comments are read by developers only; their texts for users are checked as everywhere.
 CORE = tuple(f"stereo_sfm/{room}/" for room in ("tracking", "mapping", "loop", "maps"))
 LINKS = (("stereo_sfm", "drivers"), ("stereo_sfm", "calib"))
-PAGES = ("stereo_sfm/**/static/*.html",)
+PAGES = ("*.md", "docs/**/*.md", "changelog.d/*.md", "packaging/**/*.md", "stereo_sfm/**/static/*.html")
 
 
 def programs() -> Iterator[Path]:

@@ -37,7 +37,10 @@ def add_arguments(add_action: Callable[..., argparse.ArgumentParser]) -> None:
     update = add_action("update", help="put sessions into the map of a store, which stays as large as the store")
     update.add_argument("store", type=Path, metavar="STORE", help="map folder; created by the first session")
     update.add_argument(
-        "walks", nargs="+", metavar="WALK", help="a recording or another source, or the folder of a run or of its map"
+        "walks",
+        nargs="+",
+        metavar="SESSION",
+        help="a recording or another source, the folder of a run, or its map",
     )
     update.add_argument("--keep", type=int, default=5, metavar="N", help="earlier versions to keep (default: 5)")
     add_config_arguments(update)
@@ -226,4 +229,4 @@ def _write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
 
 def _check_store(store: Path) -> None:
     if not (store / "map.json").is_file():
-        raise StereoSfmError(f"no map at {store}: 'stereo-sfm map update {store} WALK' begins one")
+        raise StereoSfmError(f"no map at {store}: 'stereo-sfm map update {store} SESSION' begins one")
