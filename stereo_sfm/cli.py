@@ -38,6 +38,7 @@ COMMANDS: dict[str, str] = {
     "vocabulary": "train or describe the vocabulary of place recognition",
     "ablation": "compare the features, estimators and modules of the papers",
     "eval": "compare a trajectory with ground truth",
+    "compare": "show several runs on one page: trajectories, errors, times",
     "sources": "list the kinds of cameras and datasets that can be opened, and their options",
     "devices": "list the attached cameras",
     "t265": "install or check the firmware of a T265, or reset the camera",

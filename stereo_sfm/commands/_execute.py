@@ -101,7 +101,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         CorrectionKeeper(o.source.camera_store, info.rig, info.given_rig).keep_last(record.calibrations)
         link_latest(folder)
     if not o.quiet:
-        print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))
+        where = f"written to {folder} (start with {folder / 'report.md'}, or report.html)"
+        print("\n".join([*summary(stats, evaluations), where]))
     if problem is not None:
         raise problem
     if interrupted:

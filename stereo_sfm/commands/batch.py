@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         again = ", from before" if result.get("resumed") else ""
         print(f"{len(results)}/{len(tasks)} {Path(task.folder).name}: {state}{again}", file=sys.stderr)
         rows = [batch.table_row(n, results[str(f)]) for n, f in zip(names, folders, strict=True) if str(f) in results]
-        batch.write_table(rows, args.output)
+        batch.write_results(rows, args.output)
     print((args.output / "results.md").read_text("utf-8-sig"), end="")
     maps = [
         folder / "map" for folder in folders if (folder / "map" / "map.json").exists() and results[str(folder)]["ok"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--max-ape", type=float, metavar="METRES", help="exit with 3 if the ATE is larger")
     parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--table", type=Path, metavar="PATH", help="write every frame's error to PATH.csv and .parquet")
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write trajectory.png and errors.png to FOLDER")
 
 
@@ -55,6 +57,7 @@ class EvalOptions:
     t_max_diff: float | None
     max_ape: float | None
     json: bool
+    table: Path | None
     plot: Path | None
 
 
@@ -78,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
         )
     if options.plot is not None:
         _plot(options.plot, options.estimate.stem, result)
+    if options.table is not None:
+        _table(options.table, result)
     if options.json:
         print(json.dumps(result.to_dict(), indent=2))
     else:
@@ -88,6 +93,22 @@ def run(args: argparse.Namespace) -> int:
         print(f"stereo-sfm eval: ATE {result.ape_m.rmse:.6g} m is above {options.max_ape:g} m", file=sys.stderr)
         return CHECK_FAILED
     return 0
+
+
+def _table(path: Path, result: Evaluation) -> None:
+    """The errors of the compared frames as tables."""
+    from stereo_sfm.errors import writing_to
+    from stereo_sfm.eval.metrics import absolute_errors
+    from stereo_sfm.eval.tables import write_table
+
+    metres, radians = absolute_errors(result.estimate.poses, result.reference.poses)
+    off = result.estimate.positions - result.reference.positions
+    degrees = radians * (180 / math.pi) if result.oriented else radians * math.nan
+    columns = ("stamp_ns", "error_m", "error_deg", "error_x_m", "error_y_m", "error_z_m")
+    rows = zip(result.estimate.stamp_ns.tolist(), metres.tolist(), degrees.tolist(), *off.T.tolist(), strict=True)
+    with writing_to(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_table(path, columns, list(rows))
 
 
 def _check_ranges(options: EvalOptions) -> None:

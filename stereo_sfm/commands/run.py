@@ -47,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PERCENT",
         help="exit with 4 if more than PERCENT of the frames have no pose",
     )
+    parser.add_argument("--open", action="store_true", help="show the report in a browser at the end")
     parser.add_argument(
         "--matches", type=int, metavar="K", help="write an image of the matches with the last keyframe every K frames"
     )
@@ -73,4 +74,9 @@ def run(args: argparse.Namespace) -> int:
         quiet=args.quiet,
         verbose=args.verbose,
     )
-    return execute(options)[0]
+    code, folder = execute(options)
+    if args.open:
+        from stereo_sfm.commands._browser import show
+
+        show(folder / "report.html")
+    return code

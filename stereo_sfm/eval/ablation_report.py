@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.eval.plots import plot_trajectory
+from stereo_sfm.eval.tables import write_table
 from stereo_sfm.types import F64, Trajectory
 
 CellResult = dict[str, Any]
@@ -117,14 +117,14 @@ def _brief(result: CellResult | None) -> str:
     return f"{error}, {ms:.0f} ms"
 
 
-def write_csv(path: Path, results: Sequence[CellResult]) -> None:
-    """Every cell of every source."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, ["source", *COLUMNS, "set"], restval="")
-        writer.writeheader()
-        for result in results:
-            settings = " ".join(_settings(result))
-            writer.writerow({"source": result["cell"]["source"], **row_of(result), "set": settings})
+def write_tables(path: Path, results: Sequence[CellResult]) -> None:
+    """Every cell of every source, as CSV and Parquet; `path` has no suffix."""
+    rows: list[list[Any]] = []
+    for result in results:
+        row = row_of(result)
+        values = [row[name] for name in COLUMNS]
+        rows.append([result["cell"]["source"], *values, " ".join(_settings(result))])
+    write_table(path, ("source", *COLUMNS, "set"), rows)
 
 
 def _settings(result: CellResult) -> tuple[str, ...]:
@@ -247,13 +247,14 @@ def write_plots(folder: Path, slug: str, results: Sequence[CellResult]) -> list[
         path = folder / f"{slug}-{name}.png"
         longest = max(members, key=lambda a: len(a["true_path"]))
         plot_trajectory(path, {_cell_name(a): _path(a["path"]) for a in members}, _path(longest["true_path"]))
+        path.with_suffix(".svg").unlink()  # the report is Markdown
         written.append(path.name)
     return written
 
 
 def write_report(folder: Path, results: Sequence[CellResult]) -> Path:
-    """ablation.md, ablation.csv and the plots. Returns the path of the first."""
-    write_csv(folder / "ablation.csv", results)
+    """ablation.md, ablation.csv, ablation.parquet and the plots. Returns the path of the first."""
+    write_tables(folder / "ablation", results)
     lines = ["# Ablation", ""]
     lines += [
         "Relative errors are between consecutive frames, absolute ones of the last pose with the first poses aligned "

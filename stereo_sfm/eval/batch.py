@@ -16,6 +16,7 @@ from typing import Any
 
 from stereo_sfm.config import Config, dump
 from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.eval.tables import write_table
 
 RESULT = "result.json"
 RETRIES = 3  # of a task whose node died
@@ -148,33 +149,31 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
 COLUMNS = ("recording", "frames", "tracked %", "keyframes", "loops", "path m", "ATE mm", "frames/s", "result")
 
 
-def table_row(name: str, result: dict[str, Any]) -> list[str]:
-    """One line of the table of results."""
+def table_row(name: str, result: dict[str, Any]) -> list[Any]:
+    """One line of the table of results; None where there is no value."""
     if not result["ok"]:
-        return [name, *["-"] * (len(COLUMNS) - 2), f"failed: {result['error'].strip().splitlines()[-1]}"]
+        return [name, *[None] * (len(COLUMNS) - 2), f"failed: {result['error'].strip().splitlines()[-1]}"]
     stats = result["stats"]
     ate = stats["evaluation"].get("map", stats["evaluation"].get("odometry"))
     return [
         name,
-        str(stats["frames"]),
-        f"{100 - stats['lost_percent']:.1f}",
-        str(stats["keyframes"]),
-        str(stats["loops_accepted"]),
-        f"{stats['path_m']:.1f}",
-        "-" if ate is None else f"{ate['ape_m']['rmse'] * 1e3:.1f}",
-        f"{stats['frames_per_s']:.1f}",
+        stats["frames"],
+        round(100 - stats["lost_percent"], 1),
+        stats["keyframes"],
+        stats["loops_accepted"],
+        round(stats["path_m"], 1),
+        None if ate is None else round(ate["ape_m"]["rmse"] * 1e3, 1),
+        round(stats["frames_per_s"], 1),
         str(stats["fingerprint"]),
     ]
 
 
-def write_table(rows: Sequence[Sequence[str]], folder: Path) -> None:
-    """results.md, and results.csv, where what is missing is empty: its columns are read as numbers."""
-    import csv
-
-    lines = [f"| {' | '.join(r)} |" for r in (COLUMNS, ["---"] * len(COLUMNS), *rows)]
+def write_results(rows: Sequence[Sequence[Any]], folder: Path) -> None:
+    """results.md for people; results.csv and results.parquet for programs, where what is missing is empty."""
+    shown = [["-" if cell is None else str(cell) for cell in row] for row in rows]
+    lines = [f"| {' | '.join(r)} |" for r in (COLUMNS, ["---"] * len(COLUMNS), *shown)]
     (folder / "results.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    with (folder / "results.csv").open("w", newline="", encoding="utf-8") as stream:
-        csv.writer(stream).writerows([COLUMNS, *(["" if cell == "-" else cell for cell in row] for row in rows)])
+    write_table(folder / "results", COLUMNS, rows)
 
 
 def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:

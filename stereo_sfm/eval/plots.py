@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -23,8 +24,11 @@ FLAT = {"left": 0.09, "right": 0.97, "bottom": 0.17, "top": 0.9}
 
 
 def _save(figure: Figure, path: Path) -> None:
+    """As a picture, and as vectors, which `html_page.take_plots` puts into a page."""
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=110)
+    with rc_context({"svg.hashsalt": path.stem, "svg.fonttype": "none"}):
+        figure.savefig(path.with_suffix(".svg"), metadata={"Date": None})
 
 
 def _plane(positions: F64) -> tuple[int, int]:
@@ -153,6 +157,26 @@ def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
     axes.grid(alpha=0.3)
     if stages:
         axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    _save(figure, path)
+
+
+def plot_stage_times(path: Path, runs: dict[str, dict[str, dict[str, float]]]) -> None:
+    """Median milliseconds of the stages of several runs, beside each other.
+
+    Args:
+        path: of the picture.
+        runs: `ms` of stats.json by the run's name.
+    """
+    figure = Figure(figsize=(8, 3))
+    axes = figure.subplots(gridspec_kw=FLAT)
+    stages = list(dict.fromkeys(stage for ms in runs.values() for stage in ms if stage != "latency"))[:SHOWN_STAGES]
+    width = 0.8 / max(len(runs), 1)
+    for k, (name, ms) in enumerate(runs.items()):
+        heights = [ms[stage]["p50"] if stage in ms else 0.0 for stage in stages]
+        axes.bar(np.arange(len(stages)) + k * width, heights, width, label=name)
+    axes.set_xticks(np.arange(len(stages)) + 0.4 - width / 2, stages)
+    axes.set(ylabel="ms, median", title="time per stage")
+    axes.legend()
     _save(figure, path)
 
 

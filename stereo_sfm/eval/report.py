@@ -1,4 +1,4 @@
-"""report.md: the results of a run with plots, verdicts and advice."""
+"""report.md and report.html: the results of a run with plots, verdicts and advice."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 from stereo_sfm.eval import plots
 from stereo_sfm.eval.calibration_results import calibration_table
 from stereo_sfm.eval.evaluate import Evaluation, table
+from stereo_sfm.eval.html_page import take_plots, to_html
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.sensor_results import sensor_lines
 from stereo_sfm.eval.statistics import failure, loop_errors, summary, thousands
@@ -50,7 +51,7 @@ def write_report(
     evaluations: dict[str, Evaluation],
     go_on: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Write report.md, then its plots.
+    """Write report.md, then its plots, then both as report.html.
 
     Args:
         folder: of the run.
@@ -86,15 +87,18 @@ def write_report(
         "the time from the arrival of an image to its pose. The images of a recording are read ahead and wait in the",
         "queues: there it is no measure of speed, and the plot below omits it.",
     ]
+    drawings = _plots_by_name(folder, record, stats, estimates, evaluations)
     with (folder / "report.md").open("w", encoding="utf-8") as report:
         report.write("\n".join([*lines, "", _glossary(folder), ""]))
-        for name, draw in _plots_by_name(folder, record, stats, estimates, evaluations).items():
+        for name, draw in drawings.items():
             report.flush()
             if not go_on():
                 report.write("\nFurther plots were omitted: the run was interrupted.\n")
                 break
             draw()
             report.write(f"\n![{name}]({name}.png)\n")
+    page = to_html(source_name, (folder / "report.md").read_text("utf-8"), take_plots(folder, drawings))
+    (folder / "report.html").write_text(page, encoding="utf-8")
 
 
 def _glossary(folder: Path) -> str:

@@ -1,0 +1,125 @@
+"""Several runs beside each other: one page with their trajectories, errors and times, and a table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval import plots
+from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
+from stereo_sfm.eval.html_page import take_plots, to_html
+from stereo_sfm.eval.tables import write_table
+from stereo_sfm.types import Trajectory
+
+COLUMNS = (
+    "run", "frames", "lost percent", "keyframes", "loops", "path m", "ATE m", "ATE Sim(3) m", "scale", "frames/s",
+    "track ms", "map ms", "hash",
+)  # fmt: skip
+DIGITS = {"lost percent": ".1f", "path m": ".2f", "scale": ".5f", "frames/s": ".1f", "track ms": ".2f", "map ms": ".2f"}
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """One run.
+
+    Attributes:
+        name: shown.
+        stats: of its stats.json.
+        estimate: its map's trajectory, else its odometry.
+        reference: its ground truth, or None.
+    """
+
+    name: str
+    stats: dict[str, Any]
+    estimate: Trajectory
+    reference: Trajectory | None
+
+
+def stats_of(folder: Path) -> dict[str, Any]:
+    """The numbers of a run.
+
+    Raises:
+        StereoSfmError: not the folder of a run.
+    """
+    try:
+        return json.loads((folder / "stats.json").read_text("utf-8"))
+    except (OSError, ValueError):
+        raise StereoSfmError(f"{folder} is not the folder of a run: its stats.json cannot be read") from None
+
+
+def names_of(folders: Sequence[Path]) -> list[str]:
+    """The names of folders, with as many of their parents as make them differ."""
+    parts = [folder.resolve().parts for folder in folders]
+    longest = max(map(len, parts))
+    taken = next((n for n in range(1, longest) if len({one[-n:] for one in parts}) == len(parts)), longest)
+    return ["/".join(one[-taken:]) for one in parts]
+
+
+def compare(runs: Sequence[ComparedRun], folder: Path) -> Path:
+    """Write compare.html, compare.csv and compare.parquet into an existing folder.
+
+    A run without ground truth is compared with the first run.
+
+    Returns:
+        The page.
+    """
+    reference = next((run.reference for run in runs if run.reference is not None), None)
+    evaluations = _evaluations(runs, reference)
+    rows = [_row(run, evaluations.get(run.name)) for run in runs]
+    write_table(folder / "compare", COLUMNS, rows)
+    shown = {run.name: evaluations[run.name].estimate if run.name in evaluations else run.estimate for run in runs}
+    plots.plot_trajectory(folder / "trajectory.png", shown, reference, every_frame=True)
+    if evaluations:
+        plots.plot_errors(folder / "errors.png", evaluations)
+    plots.plot_stage_times(folder / "times.png", {run.name: run.stats["ms"] for run in runs})
+    against = "ground truth" if reference is not None else f"the run {runs[0].name}: no run has ground truth"
+    lines = [
+        f"# {len(runs)} runs", "", f"Errors are after SE(3) alignment with {against}.", "",
+        "| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|",
+        *("| " + " | ".join(map(_text, COLUMNS, row)) + " |" for row in rows), "",
+        "## Trajectories", "", "![trajectory](trajectory.png)", "",
+        *(["## Errors", "", "![errors](errors.png)", ""] if evaluations else []),
+        "## Time per stage", "", "![times](times.png)", "",
+    ]  # fmt: skip
+    page = folder / "compare.html"
+    page.write_text(
+        to_html("stereo-sfm compare", "\n".join(lines), take_plots(folder, ("trajectory", "errors", "times"))),
+        encoding="utf-8",
+    )
+    return page
+
+
+def _evaluations(runs: Sequence[ComparedRun], reference: Trajectory | None) -> dict[str, Evaluation]:
+    """By name, of the runs that can be aligned."""
+    found: dict[str, Evaluation] = {}
+    others = runs if reference is not None else runs[1:]
+    for run in others:
+        truth = run.reference if run.reference is not None else reference
+        try:
+            found[run.name] = evaluate(run.estimate, runs[0].estimate if truth is None else truth)
+        except StereoSfmError:  # too short, or no common time: its row says so by being empty
+            continue
+    return found
+
+
+def _row(run: ComparedRun, result: Evaluation | None) -> list[Any]:
+    stats = run.stats
+    ms = stats["ms"]
+    return [
+        run.name, stats["frames"], stats["lost_percent"], stats["keyframes"], stats["loops_accepted"], stats["path_m"],
+        None if result is None else result.ape_m.rmse, None if result is None else result.ate_sim3_m,
+        None if result is None else result.sim3_scale, stats["frames_per_s"],
+        *(ms[stage]["p50"] if stage in ms else None for stage in ("track", "map")), stats["fingerprint"],
+    ]  # fmt: skip
+
+
+def _text(column: str, value: Any) -> str:
+    if value is None:
+        return ""
+    if column.startswith("ATE"):
+        return length(value)
+    return format(value, DIGITS.get(column, "")) if not isinstance(value, str) else value

@@ -1,0 +1,111 @@
+"""Reports as one HTML file, tables for other programs, and several runs on one page."""
+
+from __future__ import annotations
+
+import csv
+import json
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.eval.compare import names_of
+from stereo_sfm.eval.html_page import take_plots, to_html
+from stereo_sfm.eval.tables import write_table
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two runs on the same images with other numbers of points."""
+    root = tmp_path_factory.mktemp("runs")
+    spec = "sim:aisle?size=212x200&frames=15&rate=15&seed=1"
+    for name, points in (("a", 150), ("b", 80)):
+        setting = f"tracker.max_features={points}"
+        assert main(["run", spec, "-o", str(root / name), "--inline", "-q", "--set", setting]) in (0, 4)
+    return root / "a", root / "b"
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def figures(page: str) -> list[str]:
+    return [part[: part.index("</svg>") + 6] for part in page.split("</figcaption>")[1:]]
+
+
+def test_the_report_is_one_html_file_with_its_plots(runs: tuple[Path, Path]) -> None:
+    page = (runs[0] / "report.html").read_text("utf-8")
+    text = (runs[0] / "report.md").read_text("utf-8")
+    assert page.count("<figure>") == text.count("![") >= 3
+    assert "<h2>Verdict</h2>" in page and "src=" not in page
+    ids: list[str] = []
+    for svg in figures(page):
+        ids += [i for e in ElementTree.fromstring(svg).iter() if (i := e.get("id"))]
+    assert len(ids) == len(set(ids))
+    assert not list(runs[0].glob("*.svg"))
+
+
+def test_other_files_of_the_folder_stay(tmp_path: Path) -> None:
+    (tmp_path / "mine.svg").write_text("<svg/>")
+    assert not take_plots(tmp_path, ["trajectory"]) and (tmp_path / "mine.svg").exists()
+
+
+def test_markdown_is_escaped_and_formatted() -> None:
+    page = to_html("t", "# A <b>\n\n| x | y |\n|---|---|\n| `1` | **2** |\n\n* one\n* two\n\n![gone](gone.png)", {})
+    for part in ("<h1>A &lt;b&gt;</h1>", "<td><code>1</code></td><td><b>2</b></td>", "<li>one</li><li>two</li>"):
+        assert part in page
+    assert "gone" not in page
+
+
+def test_tables_have_empty_cells_for_what_is_missing(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    write_table(tmp_path / "t", ("name", "n", "x"), [["a", 1, float("nan")], ["b", None, 0.1 + 0.2], ["", 3, None]])
+    assert (tmp_path / "t.csv").read_text().splitlines() == ["name,n,x", "a,1,", "b,,0.30000000000000004", ",3,"]
+    columns = parquet.read_table(tmp_path / "t.parquet").to_pydict()
+    assert columns == {"name": ["a", "b", None], "n": [1, None, 3], "x": [None, 0.1 + 0.2, None]}
+
+
+def test_eval_writes_the_error_of_every_frame(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = "sim:aisle?size=212x200&frames=15&rate=15&seed=1"
+    assert main(["eval", str(runs[0]), "--ref", truth, "--table", str(tmp_path / "errors"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    rows = rows_of(tmp_path / "errors.csv")
+    errors = np.array([float(row["error_m"]) for row in rows])
+    assert len(rows) == result["frames"]
+    assert np.sqrt((errors**2).mean()) == pytest.approx(result["ape_m"]["rmse"], rel=1e-9)
+
+
+def test_runs_are_compared_on_one_page(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    assert main(["compare", *map(str, runs), "-o", str(tmp_path)]) == 0
+    page = (tmp_path / "compare.html").read_text("utf-8")
+    assert len(figures(page)) == 3 and page.count("<tr>") == 3
+    rows = rows_of(tmp_path / "compare.csv")
+    assert [row["run"] for row in rows] == ["a", "b"]
+    assert all(0 < float(row["ATE m"]) < 0.2 for row in rows) and rows[0]["hash"] != rows[1]["hash"]
+
+
+def test_what_is_no_run_is_said(runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", str(runs[0]), str(tmp_path), "-o", str(tmp_path / "out")]) == 2
+    assert "is not the folder of a run" in capsys.readouterr().err
+    assert main(["compare", str(runs[0]), str(runs[0]), "-o", str(tmp_path / "out")]) == 2
+
+
+def test_names_differ() -> None:
+    assert names_of([Path("/x/a"), Path("/x/b")]) == ["a", "b"]
+    assert names_of([Path("/x/1/run"), Path("/x/2/run")]) == ["1/run", "2/run"]
+
+
+def test_without_a_desktop_a_line_says_where_the_page_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    from stereo_sfm.commands._browser import show
+
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"):
+        monkeypatch.delenv(name, raising=False)
+    show(tmp_path / "report.html")
+    assert str(tmp_path / "report.html") in capsys.readouterr().err
