@@ -1,4 +1,4 @@
-"""Starts the service beside the robot's other nodes: ros2 launch examples/ros2/stereo_sfm.launch.py [config:=FILE]."""
+"""Starts the service beside the robot's other nodes: ros2 launch stereo_sfm_ros stereo_sfm.launch.py [config:=FILE]."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from launch.substitutions import LaunchConfiguration
 
 def generate_launch_description() -> LaunchDescription:
     """The service as a process that is started again when it ends."""
-    default = str(Path(__file__).with_name("robot.toml"))
+    default = str(Path(__file__).resolve().parents[1] / "config" / "robot.toml")
     service = ExecuteProcess(
         cmd=["stereo-sfm", "serve", "-c", LaunchConfiguration("config")],
         output="screen",

@@ -14,7 +14,7 @@ _DDS = (
     "ros2         DDS on every network, by ROS_DOMAIN_ID; no token: whoever is in the domain may call the services.",
     "             ROS_LOCALHOST_ONLY=1 hides it from others, but its ports stay open on every network.",
     "             On this computer only: ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, with",
-    "             FASTRTPS_DEFAULT_PROFILES_FILE=examples/ros2/this_computer.xml, or in CYCLONEDDS_URI",
+    "             FASTRTPS_DEFAULT_PROFILES_FILE=packaging/ros2/config/this_computer.xml, or in CYCLONEDDS_URI",
     '             <General><Interfaces><NetworkInterface name="lo"/></Interfaces></General>',
 )
 _NONE = "nothing listens: no output and no page is enabled"
