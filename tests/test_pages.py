@@ -65,6 +65,13 @@ def test_the_documentation_is_short() -> None:
     assert len((ROOT / "README.md").read_text().split()) <= 560
 
 
+def test_every_picture_is_made_by_the_script() -> None:
+    text = (ROOT / "docs" / "pictures.py").read_text()
+    shown = {name for page in READ for name in re.findall(r"!\[[^]]*\]\((?:\.\./|docs/)?([\w.]+)\)", page.read_text())}
+    assert shown and all(f'"{name}": ' in text for name in shown), shown
+    assert shown == {path.name for path in (ROOT / "docs").glob("*.png")}
+
+
 def blocks(page: Path) -> list[list[str]]:
     """Indented blocks of a page that contain a command."""
     found = re.findall(r"(?:^    .*\n)+", re.sub(r"```.*?```", "", page.read_text(), flags=re.S), re.M)
