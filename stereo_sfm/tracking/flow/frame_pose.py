@@ -21,9 +21,9 @@ from stereo_sfm.tracking.flow.consensus import (
     MIN_WEIGHT,
     SETTLED_S,
     WEIGHT_RATIO,
-    errors_at,
     in_group,
 )
+from stereo_sfm.tracking.flow.pose_solver import SeenPoints
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
@@ -337,10 +337,17 @@ class FramePoseSolver:
 
     def refine_depth(self, tracks: Tracks, solution: PoseSolution) -> None:
         """Update the distances of inliers whose position is not from the map."""
+        inlier = solution.inlier & ~tracks.mapped
         pose_solver.refine_depth(
-            solution.pose, solution.velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction,
-            tracks.rho, tracks.variance, tracks.uv, tracks.right_on_curve(), solution.inlier & ~tracks.mapped,
-            self.cameras.cams, self.cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
+            solution.pose, solution.velocity, self._seen(tracks), inlier, self.cameras, self._config.depth_sigma_px,
+            MIN_DEPTH_SIGMA,
+        )  # fmt: skip
+
+    def _seen(self, tracks: Tracks) -> SeenPoints:
+        """The tracks as the solver takes them."""
+        return SeenPoints(
+            tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.right_on_curve(),
+            self._shutter.row_seconds(tracks.uv),
         )  # fmt: skip
 
     def _optimise(
@@ -355,20 +362,15 @@ class FramePoseSolver:
 
     def _errors(self, tracks: Tracks, pose: F64, velocity: F64) -> F64:
         """(N,) whitened errors of the points at a pose (4, 4), with a velocity (6,) during the readout."""
-        return errors_at(
-            pose, velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho,
-            tracks.variance, tracks.uv, tracks.right_on_curve(), self.cameras.cams, self.cameras.right_T_left,
-            self._config.sigma_px * self._noise,
-        )  # fmt: skip
+        sigma_px = self._config.sigma_px * self._noise
+        return pose_solver.errors_at(pose, velocity, self._seen(tracks), self.cameras, sigma_px)
 
     def _optimise_all(self, tracks: Tracks, start: ExpectedMotion, prior: ExpectedMotion | None) -> PoseSolution:
         sigma_px = self._config.sigma_px * self._noise
         sigmas = NO_PRIOR if prior is None else np.repeat(self._usual_sigmas(prior, 1.0), 3)
         pose, velocity, covariance, error = pose_solver.optimise_pose(
-            start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(),
-            self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
-            tracks.uv, tracks.right_on_curve(), self.cameras.cams, self.cameras.right_T_left, sigma_px, CAUCHY_SCALES,
-            start.pose if prior is None else prior.pose, sigmas,
+            start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(), self._seen(tracks), self.cameras,
+            sigma_px, CAUCHY_SCALES, start.pose if prior is None else prior.pose, sigmas,
         )  # fmt: skip
         return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas)
 
