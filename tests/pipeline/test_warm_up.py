@@ -17,8 +17,7 @@ from stereo_sfm.demo import demo_recording
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.pipeline.warm_up import images, keyframes
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.tracking.flow import frame_pose
-from stereo_sfm.tracking.flow.consensus import errors_at
+from stereo_sfm.tracking.flow import pose_solver
 from tests.calib.test_formats import RIGS
 
 CHILD = """
@@ -118,7 +117,8 @@ def test_a_helper_compiles_only_what_the_tracker_needs(rig: str) -> None:
 @pytest.mark.parametrize("rig", RIGS)
 def test_the_last_images_of_the_warm_up_show_two_motions(rig: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    monkeypatch.setattr(frame_pose, "errors_at", lambda *given: seen.append(len(given[5])) or errors_at(*given))
+    errors_at = pose_solver.errors_at
+    monkeypatch.setattr(pose_solver, "errors_at", lambda *given: seen.append(len(given[2].rho)) or errors_at(*given))
     tracker = make_tracker(Config(), RIGS[rig])
     for image in images(RIGS[rig]):
         tracker.step(image)

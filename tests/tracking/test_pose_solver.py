@@ -40,6 +40,10 @@ def scene(camera: Camera, count: int, seed: int) -> tuple[F64, F64, F64, F64]:
     return pose, se3.transform(pose, points_cam), uv[keep], uv_right
 
 
+def seen(direction: F64, rho: F64, variance: F64, uv: F64, uv_right: F64) -> pose_solver.SeenPoints:
+    return pose_solver.SeenPoints(np.zeros_like(direction), direction, rho, variance, uv, uv_right, np.zeros(0))
+
+
 def solve(
     camera: Camera,
     points: F64,
@@ -52,8 +56,8 @@ def solve(
     distance = np.linalg.norm(points, axis=1)
     n = len(points)
     pose, _, covariance, error = pose_solver.optimise_pose(
-        np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((n, 3)), points / distance[:, None],
-        1 / distance, np.full(n, variance), uv, uv_right, cameras.cams, cameras.right_T_left, 0.5, SCALES,
+        np.eye(4), np.zeros(6), 0.1, np.ones(6),
+        seen(points / distance[:, None], 1 / distance, np.full(n, variance), uv, uv_right), cameras, 0.5, SCALES,
         *prior,
     )  # fmt: skip
     return pose, covariance, error
@@ -158,9 +162,8 @@ def test_uncertain_distances_do_not_shorten_a_step() -> None:
         rho = 1 / np.linalg.norm(points, axis=1)
         noisy = rho * (1 + relative * rng.normal(size=len(rho)))
         found = pose_solver.optimise_pose(
-            np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((len(rho), 3)), bearing, noisy,
-            (relative * rho) ** 2, uv, np.full_like(uv, np.nan), cameras.cams, cameras.right_T_left, 0.3, SCALES,
-            *NO_PRIOR,
+            np.eye(4), np.zeros(6), 0.1, np.ones(6),
+            seen(bearing, noisy, (relative * rho) ** 2, uv, np.full_like(uv, np.nan)), cameras, 0.3, SCALES, *NO_PRIOR,
         )[0]  # fmt: skip
         steps.append(found[2, 3] / 0.06)
     assert abs(np.mean(steps) - 1) < 3 * np.std(steps) / np.sqrt(len(steps)) + 1e-3
@@ -177,8 +180,8 @@ def test_poses_that_are_products_of_many_stay_rotations() -> None:
     pose[:3, :3] += np.random.default_rng(0).normal(0, 1e-6, (3, 3))
     for _ in range(1000):
         pose, *_ = pose_solver.optimise_pose(
-            pose, np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros_like(points), points / distance[:, None],
-            1 / distance, np.full(len(points), 1e-10), uv, uv_right, cameras.cams, cameras.right_T_left, 0.5,
+            pose, np.zeros(6), 0.1, np.ones(6),
+            seen(points / distance[:, None], 1 / distance, np.full(len(points), 1e-10), uv, uv_right), cameras, 0.5,
             SCALES, *NO_PRIOR,
         )  # fmt: skip
     assert np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < 1e-12

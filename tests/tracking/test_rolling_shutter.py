@@ -61,11 +61,13 @@ def solve(shutter: RollingShutter, points: F64, uv: F64, uv_right: F64, start: F
     camera = CAMERAS[0]
     distance, n = np.linalg.norm(points, axis=1), len(points)
     cameras = StereoCameras.of(rig(camera))
-    pose, velocity, _, _ = pose_solver.optimise_pose(
-        start, 0.9 * VELOCITY * 0.1, 0.1, np.full(6, sigma), shutter.row_seconds(uv), np.zeros((n, 3)),
-        points / distance[:, None], 1 / distance, np.full(n, 1e-12), uv, uv_right, cameras.cams,
-        cameras.right_T_left, 0.1, SCALES, np.eye(4), np.full(6, np.inf),
+    seen = pose_solver.SeenPoints(
+        np.zeros((n, 3)), points / distance[:, None], 1 / distance, np.full(n, 1e-12), uv, uv_right,
+        shutter.row_seconds(uv),
     )  # fmt: skip
+    pose, velocity, _, _ = pose_solver.optimise_pose(
+        start, 0.9 * VELOCITY * 0.1, 0.1, np.full(6, sigma), seen, cameras, 0.1, SCALES, np.eye(4), np.full(6, np.inf)
+    )
     return pose, velocity
 
 

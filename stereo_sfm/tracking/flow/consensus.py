@@ -9,16 +9,10 @@ stands still for a moment, too. A mark is evidence that moves both ways: agreeme
 it. New points beside marked ones start with as much as these have, never with more: marks in a still room fade.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
-
 from __future__ import annotations
-
-import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.tracking.flow.pose_solver import row_residuals
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, I32, I64, Bool, Corners
 
@@ -150,16 +144,6 @@ def in_group(tracks: Tracks, points: Bool) -> Bool:
     return out
 
 
-def beside_moving(tracks: Tracks) -> Bool:
-    """(N,) which static points have a moving one among their nearest neighbours, at about their distance."""
-    out = np.zeros(len(tracks), bool)
-    if not tracks.moving.any():
-        return out
-    rows = np.flatnonzero(~tracks.moving)
-    out[rows] = _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, tracks.moving) > 0
-    return out
-
-
 def without_moving(corners: Corners, tracks: Tracks, movers: Movers) -> Corners:
     """The corners that are not on moving objects."""
     distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
@@ -167,27 +151,3 @@ def without_moving(corners: Corners, tracks: Tracks, movers: Movers) -> Corners:
     return Corners(
         corners.uv_left[static], corners.uv_right[static], corners.points_cam[static], corners.descriptors[static]
     )
-
-
-@njit
-def errors_at(
-    pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma
-):  # fmt: skip
-    """(N,) whitened errors of points at a pose, as from `pose_solver.optimise_pose`, with its arguments."""
-    error = np.full(len(rho), np.inf)
-    res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
-    row, step = pose.copy(), np.zeros((4, 4))
-    for k in range(len(rho)):
-        rows = row_residuals(
-            k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
-        )
-        if rows == 0:
-            continue
-        rr, gr, gg = 0.0, 0.0, 0.0
-        for i in range(rows):
-            rr += res[i] * res[i]
-            gr += ray[i] * res[i]
-            gg += ray[i] * ray[i]
-        c = variance[k] / (sigma * sigma + variance[k] * gg)
-        error[k] = math.sqrt(max(rr - c * gr * gr, 0.0) / rows) / sigma
-    return error

@@ -19,30 +19,43 @@ view from a rolling shutter camera, ECCV 2006), with the mean velocity since the
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into, rectify_rotation
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
+from stereo_sfm.types import F64
 
 MAX_SIGMAS = 4.0  # change of an inverse distance while a pose is solved
 MIN_RHO = 1e-4  # 1/m
 
 
+class SeenPoints(NamedTuple):
+    """N points on the rays of their first observations, and where one frame sees them."""
+
+    origin: F64  # (N, 3) metres, odometry frame
+    direction: F64  # (N, 3) unit, odometry frame
+    rho: F64  # (N,) 1/m
+    variance: F64  # (N,) of rho
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where unseen
+    row_s: F64  # (N,) seconds from the pose's time to that of the point's row; (0,) for a global shutter
+
+
 @inlined
-def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left, res, jac, ray):
+def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cameras, res, jac, ray):
     """Residuals of one point in both images.
 
     Args:
-        pose: (4, 4) odom_T_cam. px..pz: the point and dx..dz: its derivative by rho, odometry frame. cams: models and
-            parameters (model_l, params_l, model_r, params_r).
+        pose: (4, 4) odom_T_cam. px..pz: the point and dx..dz: its derivative by rho, odometry frame.
+        uv_l, uv_r: (2,) px. cameras: StereoCameras.
         res (4,), jac (4, 6), ray (4,): filled in; derivatives by odom_T_cam @ exp(xi) and by rho.
 
     Returns:
         0 if the left pixel cannot be predicted, 2 with the left image only, 4 with both.
     """
-    model_l, params_l, model_r, params_r = cams
     qx, qy, qz = px - pose[0, 3], py - pose[1, 3], pz - pose[2, 3]
     x = pose[0, 0] * qx + pose[1, 0] * qy + pose[2, 0] * qz
     y = pose[0, 1] * qx + pose[1, 1] * qy + pose[2, 1] * qz
@@ -50,7 +63,7 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
     gx = pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz
     gy = pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz
     gz = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-    a = project_one(model_l, params_l, x, y, z)
+    a = project_one(cameras.model_l, cameras.params_l, x, y, z)
     if math.isnan(a[0]):
         return 0
     rows = 2
@@ -61,11 +74,11 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
         jac[i, 0], jac[i, 1], jac[i, 2] = -ju, -jv, -jw
         jac[i, 3], jac[i, 4], jac[i, 5] = jv * z - jw * y, jw * x - ju * z, ju * y - jv * x
     if not math.isnan(uv_r[0]):
-        t = right_T_left
+        t = cameras.right_T_left
         rx = t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]
         ry = t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]
         rz = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
-        b = project_one(model_r, params_r, rx, ry, rz)
+        b = project_one(cameras.model_r, cameras.params_r, rx, ry, rz)
         if not math.isnan(b[0]):
             rows = 4
             res[2], res[3] = b[0] - uv_r[0], b[1] - uv_r[1]
@@ -81,20 +94,18 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
 
 
 @njit
-def normal_equations(
-    pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma, scale,
-    normal, rhs, error, elimination,
-):  # fmt: skip
+def normal_equations(pose, velocity, points, rho, cameras, sigma, scale, normal, rhs, error, elimination):
     """Sums over all points, each with its distance eliminated; a robust weight by a Cauchy kernel of `scale` sigmas.
 
     Args:
-        prior, variance: (N,) of each inverse distance. rho: (N,) where it is linearised.
+        rho: (N,) inverse distances at which the points are linearised; those of `points` are their priors.
         normal (n, n), rhs (n,), error (N,): overwritten; see `optimise_pose`. n is 6, with a rolling shutter 12.
         elimination: (N, 7) overwritten: minus the step of rho is its last column and the others times the pose's step.
 
     Returns:
         The sum of the weights.
     """
+    origin, direction, prior, variance, uv_l, uv_r, row_s = points
     res, jac, ray, jr = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros(6)
     gradient, block = np.zeros(6), np.zeros((6, 6))  # of one point
     rolling = len(row_s) > 0
@@ -114,7 +125,7 @@ def normal_equations(
             compose_into(pose, step, row)
         rows = point_residuals(
             row, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
-            uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+            uv_l[k], uv_r[k], cameras, res, jac, ray,
         )  # fmt: skip
         if rows == 0:
             error[k] = np.inf
@@ -198,8 +209,7 @@ def _move_distances(rho, prior, variance, elimination, xi, row_s):
 
 @njit
 def optimise_pose(
-    pose, moved, seconds, velocity_sigma, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left,
-    sigma, scales, expected, expected_sigmas,
+    pose, moved, seconds, velocity_sigma, points, cameras, sigma, scales, expected, expected_sigmas
 ):  # fmt: skip
     """Pose of a frame.
 
@@ -207,9 +217,7 @@ def optimise_pose(
         pose: (4, 4) odom_T_cam to start from.
         moved: (6,) tangent from the last frame's pose to that one, `seconds` before. velocity_sigma: (6,) standard
             deviation of the velocity at this frame from the mean since the last. These are for rolling shutters only.
-        row_s: (N,) seconds from the pose's time to that of the row of each point; empty for a global shutter.
-        origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
-        uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen.
+        points: SeenPoints. cameras: StereoCameras.
         sigma: px, noise of one coordinate. scales: (S,) Cauchy scales in sigmas, one Gauss-Newton step each.
         expected: (4, 4) prior of the pose. expected_sigmas: (6,) its standard deviations, metres and radians along and
             about the camera's axes; infinite: there is none.
@@ -219,18 +227,16 @@ def optimise_pose(
         squared residual over the number of rows (1: as expected; inf if not visible).
     """
     rate = 1.0 / seconds if seconds > 0 else 0.0
+    prior, variance, row_s = points.rho, points.variance, points.row_s
     pose, moved, velocity = pose.copy(), moved.copy(), moved * rate
-    error = np.full(len(rho), np.inf)
+    error = np.full(len(prior), np.inf)
     n = 12 if len(row_s) > 0 else 6
     normal, factor = np.zeros((n, n)), np.zeros((n, n))
     rhs, xi, move = np.zeros(n), np.zeros(n), np.zeros((4, 4))
-    prior, rho, elimination = rho, rho.copy(), np.zeros((len(rho), 7))
+    rho, elimination = prior.copy(), np.zeros((len(prior), 7))
     for step in range(len(scales) + 1):  # the last pass is for errors and covariance
         scale = scales[min(step, len(scales) - 1)]
-        used = normal_equations(
-            pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma,
-            scale, normal, rhs, error, elimination,
-        )  # fmt: skip
+        used = normal_equations(pose, velocity, points, rho, cameras, sigma, scale, normal, rhs, error, elimination)
         if math.isfinite(expected_sigmas[0]):
             _add_prior(pose, expected, expected_sigmas, normal, rhs)
         for i in range(n - 6):  # prior of the velocity: the mean motion since the last frame
@@ -264,141 +270,66 @@ def optimise_pose(
 
 
 @inner
-def row_residuals(
-    k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
-):  # fmt: skip
+def _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray):
     """`point_residuals` of point k, with the camera where it was when the point's row was exposed.
 
     `normal_equations` has this written out: it runs several times a frame, and the call would cost it half its time.
 
     Args:
-        pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left: as of `optimise_pose`.
+        pose, velocity, points, cameras: as of `optimise_pose`.
         row: (4, 4) a copy of the pose; overwritten with the pose at the row. step: (4, 4) overwritten.
         res, jac, ray: overwritten.
 
     Returns:
         The number of rows.
     """
-    ir = 1.0 / rho[k]
+    origin, direction, ir = points.origin, points.direction, 1.0 / points.rho[k]
     g = -ir * ir
-    if len(row_s) > 0:
-        exp_into(velocity, row_s[k], step)
+    if len(points.row_s) > 0:
+        exp_into(velocity, points.row_s[k], step)
         compose_into(pose, step, row)
     return point_residuals(
         row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
         origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
-        uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+        points.uv_left[k], points.uv_right[k], cameras, res, jac, ray,
     )  # fmt: skip
 
 
 @njit
-def influence(
-    pose, velocity, covariance, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale
-):  # fmt: skip
-    """What points say about a pose beside its covariance (6, 6), whether it was solved from them or from others.
-
-    A point on which much of a pose rests has a small error there whatever it shows. At a pose by the others it has not
-    (Cook & Weisberg, Residuals and Influence in Regression, 1982, section 2.2, leverage and deleted residuals).
-    Arguments as of `optimise_pose`, the last Cauchy scale.
-
-    Returns:
-        (N,) degrees of freedom of the pose that rest on each point if it was solved from them: of all points 6.
-        (N,) errors, whitened by the noise of the point and of the pose if it was solved from others; inf for points
-        that are not visible.
-    """
-    res, jac, ray, seen = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros((4, 4))
+def errors_at(pose, velocity, points, cameras, sigma):
+    """(N,) whitened errors of points at a pose, as from `optimise_pose`, with its arguments."""
+    rho, variance = points.rho, points.variance
+    error = np.full(len(rho), np.inf)
+    res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     row, step = pose.copy(), np.zeros((4, 4))
-    freedoms, errors = np.zeros(len(rho)), np.full(len(rho), np.inf)
-    spread, left, factor, white = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4)
     for k in range(len(rho)):
-        rows = row_residuals(
-            k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
-        )
+        rows = _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray)
         if rows == 0:
             continue
-        for i in range(rows, 4):
-            res[i], ray[i], jac[i] = 0.0, 0.0, 0.0
-        for a in range(4):
-            for b in range(4):
-                seen[a, b] = 0.0  # of the pose's covariance in rows a and b
-                for i in range(6):
-                    for j in range(6):
-                        seen[a, b] += jac[a, i] * covariance[i, j] * jac[b, j]
-                spread[a, b] = variance[k] * ray[a] * ray[b] + (sigma * sigma if a == b else 0.0)
-        invert_symmetric(spread, left, factor)
-        chi2 = 0.0
-        for a in range(4):
-            for b in range(4):
-                chi2 += left[a, b] * res[a] * res[b]
-                freedoms[k] += left[a, b] * seen[a, b]
-                spread[a, b] += seen[a, b]
-        freedoms[k] /= 1.0 + chi2 / (rows * scale * scale)
-        if solve_symmetric(spread, res, white, factor):
-            total = 0.0
-            for a in range(4):
-                total += res[a] * white[a]
-            errors[k] = math.sqrt(max(total, 0.0) / rows)
-    return freedoms, errors
+        rr, gr, gg = 0.0, 0.0, 0.0
+        for i in range(rows):
+            rr += res[i] * res[i]
+            gr += ray[i] * res[i]
+            gg += ray[i] * ray[i]
+        c = variance[k] / (sigma * sigma + variance[k] * gg)
+        error[k] = math.sqrt(max(rr - c * gr * gr, 0.0) / rows) / sigma
+    return error
 
 
 @njit
-def pull(
-    pose, velocity, covariance, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale,
-    points,
-):  # fmt: skip
-    """How far from a pose, with covariance (6, 6), the others alone would have it than some `points` (N,), in squared
-    sigmas; inf if it rests on these.
-
-    To first order: at a pose by all, the gradients of these and of the others cancel each other. Arguments as of
-    `optimise_pose`, the last Cauchy scale.
-    """
-    rows = np.flatnonzero(points)
-    n = 12 if len(row_s) > 0 else 6
-    normal, rhs, inverse, factor = np.zeros((n, n)), np.zeros(n), np.full((6, 6), np.inf), np.zeros((6, 6))
-    x = np.zeros(6)
-    normal_equations(
-        pose, velocity, row_s[rows] if len(row_s) > 0 else row_s, origin[rows], direction[rows], rho[rows],
-        variance[rows], rho[rows], uv_l[rows], uv_r[rows], cams, right_T_left, sigma, scale, normal, rhs,
-        np.empty(len(rows)), np.empty((len(rows), 7)),
-    )  # fmt: skip
-    if not invert_symmetric(covariance, inverse, factor):
-        return math.inf
-    if n == 12:  # the velocity is unknown
-        y, own = np.zeros(6), np.ascontiguousarray(normal[6:, 6:]) + 1e-9 * np.eye(6)
-        for i in range(6):
-            if not solve_symmetric(own, normal[6:, i].copy(), y, factor):
-                return math.inf
-            rhs[i] -= (y * rhs[6:]).sum()
-            for j in range(6):
-                normal[j, i] -= (normal[j, 6:] * y).sum()
-    for i in range(6):
-        for j in range(6):
-            inverse[i, j] -= normal[i, j]
-    if not solve_symmetric(inverse, rhs[:6].copy(), x, factor):
-        return math.inf
-    total = 0.0
-    for i in range(6):
-        total += rhs[i] * x[i]
-    return total
-
-
-@njit
-def refine_depth(
-    pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor
-):
+def refine_depth(pose, velocity, points, inlier, cameras, sigma, floor):
     """Update rho and its variance (in place) by one frame's observations, pose and velocity given.
 
     `sigma` is larger than the pixel noise: successive errors of one patch are correlated, and the pose was fitted to
     the same pixels. `floor` is the smallest relative standard deviation.
     """
+    rho, variance = points.rho, points.variance
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     row, step = pose.copy(), np.zeros((4, 4))  # the pose at the point's row
     for k in range(len(rho)):
         if not inlier[k]:
             continue
-        rows = row_residuals(
-            k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
-        )
+        rows = _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray)
         if rows == 0:
             continue
         gr, gg = 0.0, 0.0
@@ -406,5 +337,5 @@ def refine_depth(
             gr += ray[i] * res[i]
             gg += ray[i] * ray[i]
         information = 1.0 / variance[k] + gg / (sigma * sigma)
-        rho[k] = max(rho[k] - gr / (sigma * sigma) / information, 1e-4)
+        rho[k] = max(rho[k] - gr / (sigma * sigma) / information, MIN_RHO)
         variance[k] = max(1.0 / information, (floor * rho[k]) ** 2)

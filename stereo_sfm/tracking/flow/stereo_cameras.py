@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,8 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 
-@dataclass(frozen=True)
-class StereoCameras:
-    """Model ids and parameters of both cameras, and their relative pose."""
+class StereoCameras(NamedTuple):
+    """Model ids and parameters of both cameras, and their relative pose (4, 4)."""
 
     model_l: int
     params_l: F64
