@@ -2,7 +2,7 @@
 
 python benchmarks/results.py                  writes docs/results.md
 python benchmarks/results.py --check          whether the page is the one that the figures make
-python benchmarks/results.py --release 0.2.0  writes docs/figures/0.2.0.md, the figures of a release, which stay
+python benchmarks/results.py --release 0.2.0  writes benchmarks/figures/0.2.0.md, which stays as it is
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from _figures import page
+from _figures import FOLDER, page
 
 DOCS = Path(__file__).parents[1] / "docs"
 HEAD = """\
@@ -28,7 +28,7 @@ How the figures came about is in the [lab notebook](notebook.md).
 RELEASE = """\
 # Figures of {version}
 
-Accuracy, speed and memory of this release, per sequence. The page of [results](../results.md) explains the terms.
+Accuracy, speed and memory of this release, per sequence. The page of [results](../../docs/results.md) explains the terms.
 """
 
 
@@ -40,13 +40,12 @@ def main() -> int:
     args = parser.parse_args()
     path, head = DOCS / "results.md", HEAD
     if args.release:
-        path, head = DOCS / "figures" / f"{args.release}.md", RELEASE.format(version=args.release)
+        path, head = FOLDER / f"{args.release}.md", RELEASE.format(version=args.release)
     text = "\n".join([head, *page()]).rstrip() + "\n"
     if args.check:
         same = path.is_file() and path.read_text("utf-8") == text
         print(f"{path.name} {'is' if same else 'is not'} what the figures make")
         return int(not same)
-    path.parent.mkdir(exist_ok=True)
     path.write_text(text, encoding="utf-8")
     print(path)
     return 0
