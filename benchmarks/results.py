@@ -28,7 +28,7 @@ How the figures came about is in the [lab notebook](notebook.md).
 RELEASE = """\
 # Figures of {version}
 
-Accuracy, speed and memory of this release, per sequence. The page of [results](../../docs/results.md) explains the terms.
+Accuracy, speed and memory of this release, per sequence. [Results](../../docs/results.md) explains the terms.
 """
 
 
