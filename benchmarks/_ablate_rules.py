@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 FLOW = "tracking/flow/"
+LOSS = f"{FLOW}loss.py"
 SOLVER, TRACKER, MARKS = f"{FLOW}frame_pose.py", f"{FLOW}tracker.py", f"{FLOW}consensus.py"
 RECOVERY, STEREO, FOLLOWER = f"{FLOW}recovery.py", f"{FLOW}stereo.py", f"{FLOW}follower.py"
 CLOSER, MAPPER = "loop/closer.py", "mapping/mapper.py"
@@ -196,7 +197,7 @@ RULES = (
         "np.minimum(self._occupied(corners), self._rows).sum()",
         "self._occupied(corners).sum()",
     ),
-    _rule("covered time counts a tenth", TRACKER, "max(self._free_s, COVERED_SHARE * self._covered_s)", "self._free_s"),
+    _rule("covered time counts a tenth", LOSS, "max(self._free_s, COVERED_SHARE * self._covered_s)", "self._free_s"),
     _rule(
         "recent places",
         RECOVERY,
@@ -210,7 +211,7 @@ RULES = (
         "return True",
     ),
     _rule("search in three rounds", TRACKER, "for reach, most in ROUNDS:", "for reach, most in ROUNDS[::2]:"),
-    _rule("lost second image begins anew", TRACKER, "if begun or max(", "if max("),
+    _rule("lost second image begins anew", LOSS, "second or max(", "max("),
     _rule("blurred images", TRACKER, "return blurred if undivided else (tracks, solution)", "return tracks, solution"),
     _rule("rotation of the whole image", TRACKER, "for anywhere in (False, True):", "for anywhere in ():"),
     _rule("rotation from anywhere", TRACKER, "for anywhere in (False, True):", "for anywhere in (False,):"),

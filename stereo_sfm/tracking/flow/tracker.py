@@ -28,6 +28,7 @@ from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.keyframes import Keyframes
 from stereo_sfm.tracking.flow.knock import KnockDetector
+from stereo_sfm.tracking.flow.loss import Loss
 from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
@@ -54,7 +55,6 @@ MAX_MISSES = 3  # successive frames after which a point that disagrees is given 
 TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
 TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
-COVERED_SHARE = 0.1  # of the time that the view is covered: counts as time with a free view, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on; an image is held for then
 HOLD_NS = 200_000_000  # from one image that may be held to the next
@@ -104,12 +104,7 @@ class Tracker:
         self._pose: F64 = np.eye(4)
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
-        self._begun_ns = 0  # the first image of this submap, if nothing was lost just before
-        self._begins_anew = False  # because the second image of the submap before was lost
-        self._lost = 0  # successive frames
-        self._lost_ns = 0  # the last of them
-        self._free_s = 0.0  # for which the view has been free without a pose
-        self._covered_s = 0.0  # and covered
+        self._loss = Loss(config.lost_s)
         self._part = PartialView()
         self._bridging = False  # tracking restarts at the pose by IMU or wheels, in the same submap
         self._submap_id = 0
@@ -141,7 +136,7 @@ class Tracker:
         elif self._turn.any():  # the map does not know it yet
             update = replace(update, point_ids=update.point_ids[:0], points_map=update.points_map[:0])
         self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
-        if corrected and not self._lost:
+        if corrected and not self._loss.frames:
             self._resume(update)
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
@@ -158,11 +153,11 @@ class Tracker:
         if self._knock is not None and self._knock.given_up(image.stamp_ns):
             self._use_rig()
         expected = self._predict(image.stamp_ns)
-        blind = self._lost and self._sensors is None
+        blind = self._loss.frames and self._sensors is None
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
         if solution.reason:
             tracks, solution = self._search(image, images)
-        recovered = bool(self._lost)
+        recovered = bool(self._loss.frames)
         if not (recovered or solution.reason) and (more := self._find_more(image, images, solution.pose)) is not None:
             (tracks, solution), recovered = more, True
         if solution.reason:
@@ -352,7 +347,8 @@ class Tracker:
             self._velocity = solution.velocity if self._shutter.active else mean
         if recovered:
             self._velocity = self._recovery.motion.velocity()
-        inlier, self._begins_anew = solution.inlier & ~tracks.moving, False
+        inlier = solution.inlier & ~tracks.moving
+        self._loss.followed()
         tracks.age = tracks.age + np.int32(1)
         static = static_frames(seconds)
         tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert, static)
@@ -365,7 +361,8 @@ class Tracker:
 
     def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
-        self._state, self._lost, self._free_s, self._covered_s = TrackState.OK, 0, 0.0, 0.0
+        self._state = TrackState.OK
+        self._loss.end()
         self._follower.accept(images.left, tracks)
 
     def _begin(self, image: StereoImage, images: StereoPyramids) -> tuple[Frame, Keyframe | None]:
@@ -392,7 +389,7 @@ class Tracker:
         self._follower.forget()
         self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose, self._pose)
         self._held_ns = image.stamp_ns
-        self._begun_ns = -1 if self._begins_anew else image.stamp_ns
+        self._loss.begin(image.stamp_ns)
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         self._bridging = False
         if self._sensors is not None:
@@ -498,19 +495,10 @@ class Tracker:
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
         """Predict the pose; after some time with a free view start a new submap."""
         expected = self._expect(image.stamp_ns)
-        self._lost += 1
         self._follower.search_widely()
         bridge = self._bridge(image.stamp_ns)
-        seen = bridge is None or image.left.max() >= DARK
-        if seen:
-            unseen = (image.stamp_ns - self._stamp_ns) * 1e-9 if self._lost == 1 else 0.0  # without any image
-            seconds = (image.stamp_ns - self._lost_ns) * 1e-9 if self._lost > 1 else 0.0
-            self._free_s = self._free_s + seconds if self._recovery.free else 0.0
-            self._covered_s += unseen if self._recovery.free else seconds + unseen
-        self._lost_ns = image.stamp_ns
-        begun = self._stamp_ns == self._begun_ns  # one image is nothing to wait for, but once only
-        self._begins_anew |= begun
-        if begun or max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:
+        dark = image.left.max() < DARK
+        if self._loss.add(image.stamp_ns, self._stamp_ns, bridge is None or not dark, self._recovery.free):
             self._pose = expected.odom_T_cam
             self._velocity = self._recovery.motion.velocity_at(image.stamp_ns)
             self._solver.forget()
@@ -520,7 +508,7 @@ class Tracker:
             self._state = TrackState.INITIALIZING
             if not self._bridging:
                 self._recovery.motion.forget()
-        covered = not self._recovery.free and image.left.max() >= DARK
+        covered = not self._recovery.free and not dark
         state = TrackState.OCCLUDED if covered else TrackState.LOST
         state = state if bridge is None else TrackState.INERTIAL
         covariance = expected.covariance if bridge is None else bridge[1]
