@@ -87,7 +87,7 @@ def judge_wheel_noise(noise: float, known: Wheel) -> Finding:
     """Whether a density found in the samples is what a calibration says."""
     if not np.isfinite(noise):
         return Finding("wheels' noise", 0, "the robot drives less than a second: not shown", judged=False)
-    ticks = known.tick_m * np.sqrt(5 / 18 * known.rate_hz)  # third differences of a way that is rounded
+    ticks = known.tick_m * np.sqrt(5 / 18 * known.rate_hz)  # third differences of a path that is rounded
     stated = float(np.hypot(known.speed_noise, ticks))
     level = sum(noise / stated > limit for limit in LOUD)
     return Finding("wheels' noise", level, f"{noise:.2g} m/s/√Hz (calibration {stated:.2g})")

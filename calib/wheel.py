@@ -31,7 +31,7 @@ class Wheel(ReadOnly):
     angular_scale: float = 1.0
     slip: float = 0.05  # standard deviation of a speed's lasting error, as a share of it
     speed_noise: float = 0.01  # m/s/sqrt(Hz), white
-    tick_m: float = 0.001  # way per count of the encoders
+    tick_m: float = 0.001  # path per count of the encoders
     rate_hz: float = 50.0
     offset_s: float = 0.0  # wheel stamp minus camera stamp of the same instant
 

@@ -17,7 +17,7 @@ from stereo_sfm.geometry.twist_integration import integrate_twists
 from stereo_sfm.types import F64, I64, Bool, WheelSamples
 
 REACH_S = 0.3  # of the search for the time offset
-LINK_S = 2.0  # between the compared poses: the camera's sway is then small against the way
+LINK_S = 2.0  # between the compared poses: the camera's sway is then small against the path
 MIN_WAY_M, MIN_TURN = 2.0, 0.5  # m, rad of the whole recording, below which nothing is found
 SCALE_PERCENT, TURN_PERCENT, DIRECTION_DEG, OFFSET_MS = (0.2, 1.0), (0.5, 3.0), (0.2, 1.0), (3.0, 20.0)  # known
 POSITION_CM = 2.0, 10.0  # the same
@@ -44,8 +44,8 @@ class WheelFit:
     value: F64  # (8,) of NAMES: shares, radians, seconds and metres by which the calibration is off
     sigma: F64  # (8,)
     way_m: float  # by the images
-    agreement: float  # share of the way that both agree on, after the correction; 1 at best
-    sign: float  # correlation of the ways ahead, negative if the wheels count backwards
+    agreement: float  # share of the path that both agree on, after the correction; 1 at best
+    sign: float  # correlation of the motions ahead, negative if the wheels count backwards
     turn_sign: float  # of the turns
     noise: float = float("nan")  # m/s/sqrt(Hz) of the speed ahead
 
@@ -194,7 +194,7 @@ def judge_wheel(found: WheelFit, known: Wheel) -> list[Finding]:
     if found.sign < REVERSED:
         return [Finding("wheels", 2, "they count backwards: reverse their sign")]
     if found.turn_sign < REVERSED:
-        return [Finding("wheels", 2, "they turn the other way than the camera: exchange left and right")]
+        return [Finding("wheels", 2, "they turn in the opposite direction to the camera: exchange left and right")]
     percent, degrees, ms = 100.0, float(np.degrees(1.0)), 1e3
     rows = (
         ("scale", 0, percent, "%", SCALE_PERCENT),
@@ -206,7 +206,7 @@ def judge_wheel(found: WheelFit, known: Wheel) -> list[Finding]:
     )
     level = 0 if found.agreement > 0.9 else 1 if found.agreement > 0.7 else 2
     out = [
-        Finding("wheels", level, f"agree with the images in {100 * found.agreement:.1f} % of the way after correction")
+        Finding("wheels", level, f"agree with the images in {100 * found.agreement:.1f} % of the path after correction")
     ]
     for name, k, unit, text, sure in rows:
         value, sigma = float(found.value[k] * unit), float(found.sigma[k] * unit)

@@ -1,6 +1,6 @@
 """The floor that a robot drives over: thresholds and ramps across its way, and how it stands on them.
 
-Heights are smooth in the metres of the way (error functions), so that poses are smooth in time. They move the robot
+Heights are smooth in the metres of the path (error functions), so that poses are smooth in time. They move the robot
 only: the drawn floor stays flat.
 """
 
@@ -13,17 +13,17 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 SUPPORT_M = 0.36  # between the front and the rear contact of the robot with the floor
-FREE_M = 2.0  # of the way at its start, flat
+FREE_M = 2.0  # of the path at its start, flat
 THRESHOLD_M, THRESHOLD_WIDTH_M, EDGE_M = (0.004, 0.010), (0.05, 0.12), 0.025  # height, width, roundness of an edge
 RAMP_SLOPE, RAMP_M, RAMP_TOP_M, RAMP_ROUND_M = (0.03, 0.08), (0.8, 1.6), (1.0, 3.0), 0.15
 SLOPES = 0.05, 0.2  # between which wheels that climb begin to slip
 
 
 class Floor:
-    """Height over the metres of the way."""
+    """Height over the metres of the path."""
 
     def __init__(self, thresholds: int, ramps: int, way_m: float, rng: np.random.Generator) -> None:
-        """So many of each, at random places of a way of `way_m` metres; a ramp leads up, and down again later."""
+        """So many of each, at random places of a path of `way_m` metres; a ramp leads up, and down again later."""
         places = np.sort(rng.uniform(min(FREE_M, way_m), way_m, thresholds))
         widths, heights = rng.uniform(*THRESHOLD_WIDTH_M, thresholds), rng.uniform(*THRESHOLD_M, thresholds)
         edges = [places, places + widths]
@@ -35,7 +35,7 @@ class Floor:
         self._bends = np.concatenate(bends), np.concatenate([slope, -slope, -slope, slope])
 
     def height(self, metres: F64) -> F64:
-        """(N,) metres of the way -> (N,) metres above the start."""
+        """(N,) metres of the path -> (N,) metres above the start."""
         at, rise, width = self._steps
         steps = 0.5 * (1 + erf((metres[:, None] - at) / width)) @ rise
         at, change = self._bends
@@ -44,7 +44,7 @@ class Floor:
         return np.asarray(steps + bends, float)
 
     def slope(self, metres: F64) -> F64:
-        """(N,) metres of the way -> (N,) derivative of the height."""
+        """(N,) metres of the path -> (N,) derivative of the height."""
         at, rise, width = self._steps
         steps = np.exp(-(((metres[:, None] - at) / width) ** 2)) @ (rise / width) / np.sqrt(np.pi)
         at, change = self._bends

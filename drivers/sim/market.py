@@ -122,7 +122,7 @@ def plan(path: str) -> tuple[Market, tuple[RobotPath, ...]]:
 
 
 def _direction(paths: list[RobotPath]) -> float:
-    """Radians of the axis along or across which most of the way goes."""
+    """Radians of the axis along or across which most of the path goes."""
     total = 0j
     for p in paths:
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p.course[:, :2], axis=0), axis=1))])

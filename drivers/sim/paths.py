@@ -14,7 +14,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Trajectory
 
-STEP_M = 0.1  # least way between positions from which a direction is taken
+STEP_M = 0.1  # least distance between positions from which a direction is taken
 LEVEL = 0.9  # cosine of a tilt
 _SESSION = "seq:"  # begins a session in a file of OpenLORIS-Scene
 _SPEED, _TURN = 0.8, 0.6  # m/s and rad/s from the end of one path to the start of the next

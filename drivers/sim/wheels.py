@@ -30,7 +30,7 @@ class WheelGrade:
     difference: float = 0.0  # the same, of each wheel
     track: float = 0.0  # standard deviation, as a share
     noise: float = 0.0  # m/s of a sample, standard deviation
-    tick_m: float = 0.0  # way per count of the encoders
+    tick_m: float = 0.0  # path per count of the encoders
     threshold: float = 0.0  # m/s below which a wheel counts nothing
 
 

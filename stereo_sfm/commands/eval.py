@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-ape", type=float, metavar="METRES", help="exit with 3 if the ATE is larger")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--table", type=Path, metavar="PATH", help="write every frame's error to PATH.csv and .parquet")
-    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write trajectory.png and errors.png to FOLDER")
+    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write plots (PNG and SVG) to FOLDER")
 
 
 @dataclass(frozen=True)

@@ -238,7 +238,7 @@ class RunRecord:
 
         A frame moves with its reference keyframe. Where points are tracked from frame to frame, the next
         keyframe contributes too, the more the nearer it is: the map has moved both since the frame was tracked, by
-        different amounts. Near is what is a short way by odometry, whose errors grow with the way, not with time.
+        different amounts. Near means a short path by odometry, whose errors grow with the path, not with time.
         """
         if not len(self.map_T_kf):
             return None
@@ -381,5 +381,5 @@ class RunRecord:
 
 
 def _way(a_T_b: F64, nanoseconds: I64) -> F64:
-    """(N,) metres of ways that lead along transforms (N, 4, 4) and last for so long; a radian counts as a metre."""
+    """(N,) metres of paths along transforms (N, 4, 4) that last for so long; a radian counts as a metre."""
     return sum(se3.extent(a_T_b), start=SLOWEST * 1e-9 * np.maximum(nanoseconds, 1))

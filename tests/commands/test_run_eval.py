@@ -118,7 +118,9 @@ def test_eval_prints_the_runs_errors(
         assert main([*args, "--plot", str(tmp_path)]) == 0
         printed = json.loads(capsys.readouterr().out)
         assert printed["ape_m"]["rmse"] == pytest.approx(stats["evaluation"][name]["ape_m"]["rmse"], rel=1e-4)
-    assert {p.name for p in tmp_path.iterdir()} == {"trajectory.png", "errors.png"}
+    assert {p.name for p in tmp_path.iterdir()} == {
+        f"{n}.{kind}" for n in ("trajectory", "errors") for kind in ("png", "svg")
+    }
     assert main(["eval", str(euroc_run), "--ref", reference, "--align", "none"]) == 0
     assert "alignment none" in capsys.readouterr().out
 
