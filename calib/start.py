@@ -44,6 +44,7 @@ class StartFinding:
     rig: Rig | None = None  # the calibration that they fit; None: none is known but the given one
     shift: int = 0  # left image k belongs to right image k + shift
     shown: bool = False  # by the images; False: only a guess, for a tracker that does not start
+    advice: str = ADVICE  # what a user can do besides
 
 
 def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
