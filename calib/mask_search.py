@@ -125,24 +125,61 @@ def masked(rig: Rig, found: list[FoundMask]) -> Rig:
 
 
 def _reduced(image: U8) -> U8:
+    """The image, halved if it is wide."""
     if image.shape[1] <= MAX_WIDTH:
         return image.copy()
     return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _moments(image: U8) -> tuple[F32, F32, F32]:
-    """The image, and the mean and standard deviation of the window around each pixel."""
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """An image, and the mean and standard deviation of the window around each pixel; all (H, W)."""
+
+    grey: F32
+    mean: F32
+    deviation: F32
+
+    def compared(self, other: Moments, texture: float = TEXTURE) -> tuple[Bool, Bool]:
+        """(H, W) whether the windows have texture in both images, and whether they also show the same surface."""
+        textured = (self.deviation > texture) & (other.deviation > texture)
+        covariance = cv2.blur(self.grey * other.grey, (WINDOW, WINDOW)) - self.mean * other.mean
+        return textured, textured & (covariance > MIN_CORRELATION * self.deviation * other.deviation)
+
+
+def moments(image: U8) -> Moments:
+    """Of an image (H, W)."""
     grey = image.astype(np.float32)
     mean = cv2.blur(grey, (WINDOW, WINDOW))
     variance = np.maximum(cv2.blur(grey * grey, (WINDOW, WINDOW)) - mean * mean, 0)
-    return grey, np.asarray(mean, np.float32), np.sqrt(variance).astype(np.float32)
+    return Moments(grey, np.asarray(mean, np.float32), np.sqrt(variance).astype(np.float32))
+
+
+class FixedVotes:
+    """Counts in how many pairs of images each window has texture, and looks the same."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.votes, self.matching = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+        self.pairs = 0
+
+    def add(self, textured: Bool, matching: Bool) -> None:
+        """A pair, as `Moments.compared` gives it."""
+        self.votes += textured
+        self.matching += matching
+        self.pairs += 1
+
+    def fixed(self, min_votes: int) -> Bool:
+        """(H, W) whose windows look the same in nearly all of so many pairs or more in which they have texture."""
+        return (self.votes >= min_votes) & (self.matching > MIN_SHARE * self.votes)
 
 
 def _found(images: list[U8], pairs: list[tuple[int, int]], size: tuple[int, int]) -> FoundMask:
-    moments = [_moments(image) for image in images]
-    fixed = _fixed(moments, pairs)
-    plain = np.mean([deviation < TEXTURE for _, _, deviation in moments], axis=0) > PLAIN_SHARE
-    means = np.array([mean for _, mean, _ in moments])
+    found = [moments(image) for image in images]
+    votes = FixedVotes(found[0].grey.shape)
+    for i, j in pairs:
+        votes.add(*found[i].compared(found[j]))
+    fixed = votes.fixed(MIN_VOTES)
+    plain = np.mean([one.deviation < TEXTURE for one in found], axis=0) > PLAIN_SHARE
+    means = np.array([one.mean for one in found])
     dark = np.quantile(means, DARK_QUANTILE, axis=0) < DARK * np.median(means)
     rim = ~uncovered(~dark, WINDOW)
     part = _closed(fixed & ~rim, plain & ~dark)
@@ -151,21 +188,9 @@ def _found(images: list[U8], pairs: list[tuple[int, int]], size: tuple[int, int]
     return FoundMask(_enlarged(used, size), _enlarged(part, size), _enlarged(dark, size))
 
 
-def _enlarged(mask: Bool, size: tuple[int, int]) -> Bool:
+def _enlarged(mask: Bool, size: tuple[int, ...]) -> Bool:
+    """The mask of a reduced image at the size (H, W) of the original."""
     return cv2.resize(mask.astype(np.uint8), size[::-1], interpolation=cv2.INTER_NEAREST) > 0
-
-
-def _fixed(moments: list[tuple[F32, F32, F32]], pairs: list[tuple[int, int]]) -> Bool:
-    """(H, W) whose windows correlate in nearly all pairs in which both have texture."""
-    shape = moments[0][0].shape
-    votes, matching = np.zeros(shape, np.int32), np.zeros(shape, np.int32)
-    for i, j in pairs:
-        (a, mean_a, deviation_a), (b, mean_b, deviation_b) = moments[i], moments[j]
-        textured = (deviation_a > TEXTURE) & (deviation_b > TEXTURE)
-        covariance = cv2.blur(a * b, (WINDOW, WINDOW)) - mean_a * mean_b
-        votes += textured
-        matching += textured & (covariance > MIN_CORRELATION * deviation_a * deviation_b)
-    return (votes >= MIN_VOTES) & (matching > MIN_SHARE * votes)
 
 
 def _still(images: list[U8], lit: Bool) -> Bool:

@@ -1,8 +1,8 @@
 """The start check: whether a few of the first images fit the calibration, and what would make them fit.
 
-A pair fits if half of its stereo matches lie within a pixel of their rows, as the trackers need it. The first pair that
-fits ends the check. If none does, the calibration is corrected (`calib.wrong_rig`) or a mistake is named
-(`calib.mistakes`).
+A pair fits if half of its stereo matches lie within a pixel of their rows, as the trackers need it, and no other lens
+model fits it much better (`calib.other_lens`). The first pair that fits ends the check. If none does, the lens model or
+the calibration is corrected (`calib.wrong_rig`) or a mistake is named (`calib.mistakes`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ from itertools import islice
 
 import numpy as np
 
-from stereo_sfm.calib.matches import match_pair
 from stereo_sfm.calib.mistakes import mistake
+from stereo_sfm.calib.other_lens import other_lens
 from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.tracks import Window, still_window
 from stereo_sfm.calib.wrong_rig import LIMIT_PX, MAX_SHIFT, MIN_DISPARITY_PX, Fit, better_fit
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import U8, StereoImage
@@ -25,9 +26,11 @@ from stereo_sfm.types import U8, StereoImage
 CHOSEN = (0, 5, 10)  # the pairs that are examined, if the first one does not fit
 LOOKED_AT = CHOSEN[-1] + 1 + MAX_SHIFT  # images: some on either side of these, where pairs may be frames apart
 CORNERS = 100  # of the left image
+SEARCH_ROWS = 14  # above and below, px
 MIN_CORNERS = 25  # with fewer an image shows too little to judge a calibration
 MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
 FITTING_SHARE = 0.5  # of the matches
+CALIBRATE = "'stereo-sfm calibrate' measures lenses; 'stereo-sfm convert-calib --lens' says what a file's numbers are"
 ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images; then use '--rig rig.yaml'"
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
@@ -41,6 +44,7 @@ class StartFinding:
     rig: Rig | None = None  # the calibration that they fit; None: none is known but the given one
     shift: int = 0  # left image k belongs to right image k + shift
     shown: bool = False  # by the images; False: only a guess, for a tracker that does not start
+    advice: str = ADVICE  # what a user can do besides
 
 
 def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
@@ -59,6 +63,13 @@ def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
     light = _exposure([seen[k].left for k in CHOSEN if k < len(seen)])
     if light or not cameras.judged:
         return StartFinding(light)
+    lens = other_lens(rig, cameras.windows)
+    if lens is not None:
+        return StartFinding(
+            lens.text if lens.known else f"{lens.text}: {CALIBRATE}", lens.rig if lens.known else None, shown=True
+        )
+    if cameras.rows_fit:
+        return StartFinding()
     chosen = [k for k in CHOSEN if k < len(seen)]
     better = better_fit(rig, seen, chosen) if cameras.rectification is not None else None
     if better is not None and _confirmed(better, seen, chosen):
@@ -80,23 +91,30 @@ class _Cameras:
     def __init__(self, rig: Rig) -> None:
         self.rectification: Rectification | None = None
         self.judged = False  # a pair that shows something was seen
-        self._stereo = rig.second_camera is not None
+        self.rows_fit = False  # of one of the pairs
+        self.windows: list[Window] = []  # the matches of the pairs
+        self._rig, self._stereo = rig, rig.second_camera is not None
         if self._stereo:
             with suppress(StereoSfmError):  # no epipolar geometry: nothing fits
                 self.rectification = rectify(rig, "epipolar")
 
     def fit(self, image: StereoImage) -> bool:
-        """Whether half of the matches are near their rows; an image of one camera fits if it shows something."""
+        """Whether half of the matches are near their rows, and no other lens fits better. An image of one camera fits
+        if it shows something."""
         if image.right is None or not self._stereo:
             return not _exposure([image.left])
         if self.rectification is None:
             self.judged = True
             return False
-        found = match_pair(self.rectification, *self.rectification.apply(image.left, image.right), CORNERS)
+        window = still_window(self.rectification, image, CORNERS, SEARCH_ROWS)
+        found = window.rows
+        self.windows.append(window)
         self.judged |= found.corners >= MIN_CORNERS
         ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
         near = ahead & (np.abs(found.row_error) < LIMIT_PX)
-        return len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE
+        rows_fit = len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE
+        self.rows_fit |= rows_fit
+        return rows_fit and other_lens(self._rig, [window]) is None
 
 
 def _exposure(images: Sequence[U8]) -> str:

@@ -121,6 +121,14 @@ def _read(source: str, f: Field[Any], kind: Any, value: Any) -> Any:
         raise StereoSfmError(f"{source}: option {f.name}={value}: it must be {wanted}") from None
 
 
+def read_size(value: Any) -> tuple[int, int]:
+    """WIDTHxHEIGHT of a user. Raises ValueError with what it must be."""
+    width, _, height = value.partition("x") if isinstance(value, str) else (str(value[0]), "", str(value[1]))
+    if not (width.isdigit() and height.isdigit() and 64 <= int(width) <= 4096 and 64 <= int(height) <= 4096):
+        raise ValueError("WIDTHxHEIGHT, such as 640x400 or 1280x800")
+    return int(width), int(height)
+
+
 def _convert(kind: Any, value: Any) -> Any:
     """A value of a type from itself or from text. Raises ValueError for invalid values."""
     if _optional(kind):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Self
 
@@ -67,7 +68,10 @@ class StartCheckedSource(WrappedSource):
         if self._rig is None or given is not self._original:
             pair = rig_from_text(self._check.rig, "the start check")
             self._original = given
-            self._rig = replace(given, left=pair.left, right=pair.right, left_T_right=pair.left_T_right)
+            self._rig = replace(
+                given, left=pair.left, right=pair.right, left_T_right=pair.left_T_right, left_mask=pair.left_mask,
+                right_mask=pair.right_mask,
+            )  # fmt: skip
         return self._rig
 
     def __enter__(self) -> Self:
@@ -84,19 +88,27 @@ class StartCheckedSource(WrappedSource):
 
         self._looked_at = True
         first = _FirstImages(iter(self.source))
-        finding = check_start(self.source.rig, first.looked_at())
+        finding = self._with_sticking(check_start(self.source.rig, first.looked_at()))
         if finding.text and first.seen:
             self._check = self._report(finding, first.seen[0])
         self._images = first.passed_on()
 
-    def _report(self, finding: StartFinding, first: StereoImage) -> StartCheck:
-        from stereo_sfm.calib.start import ADVICE
+    def _with_sticking(self, finding: StartFinding) -> StartFinding:
+        """What sticks to the images is found in recordings alone: a camera that starts has not moved yet."""
+        if self.source.live:
+            return finding
+        from stereo_sfm.calib.sticking import positions, with_sticking
 
+        with suppress(StereoSfmError):  # of the source: raised when its images are passed on
+            return with_sticking(finding, self.source.rig, self.source.at(positions(self.source.frame_count)))
+        return finding
+
+    def _report(self, finding: StartFinding, first: StereoImage) -> StartCheck:
         better, remedy, rig, shift = finding.rig, "", "", 0
         if better is not None and self._correct:
-            remedy, rig, shift = f"corrected for this run; {ADVICE}", _as_text(better), finding.shift
+            remedy, rig, shift = f"corrected for this run; {finding.advice}", _as_text(better), finding.shift
         elif better is not None:
-            remedy = f"not corrected, as self-calibration does not correct here; {ADVICE}"
+            remedy = f"not corrected, as self-calibration does not correct here; {finding.advice}"
         check = StartCheck(first.frame_id, first.stamp_ns, finding.text, remedy, finding.shown, rig, shift)
         if check.shown:
             log.warning("%s", check.line)
@@ -148,8 +160,9 @@ class _FirstImages:
 
 
 def _as_text(rig: Rig) -> str:
-    """The two cameras alone."""
-    return rig_to_text(Rig(rig.left, rig.right, rig.left_T_right))
+    """The cameras alone, with their masks."""
+    left_mask, right_mask = rig.left_mask, rig.right_mask
+    return rig_to_text(Rig(rig.left, rig.right, rig.left_T_right, left_mask=left_mask, right_mask=right_mask))
 
 
 def _paired(images: Iterator[StereoImage], shift: int) -> Iterator[StereoImage]:

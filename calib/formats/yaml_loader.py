@@ -12,9 +12,11 @@ import yaml
 from yaml.events import AliasEvent
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
+from stereo_sfm.calib.mask import INLINE
+
 MAX_VALUES = 20_000  # with every alias written out
 MAX_DEPTH = 32
-MAX_VALUE_CHARS = 4096
+MAX_VALUE_CHARS = 4096  # but for masks, which are images: they have as many as the text may have
 OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 
 
@@ -44,7 +46,7 @@ class CalibrationLoader(yaml.SafeLoader):
         return node
 
     def _count(self, node: Node) -> int:
-        if isinstance(node, ScalarNode) and len(node.value) > MAX_VALUE_CHARS:
+        if isinstance(node, ScalarNode) and len(node.value) > MAX_VALUE_CHARS and not node.value.startswith(INLINE):
             raise ValueError(f"a value has {len(node.value)} characters")
         count = 1 + sum(self._values[child] for child in _children(node))
         if max(count, len(self._values)) > MAX_VALUES:

@@ -4,27 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from stereo_sfm.drivers.driver import Attached, Cameras, Driver, UsbId
-from stereo_sfm.drivers.options import SourceOptions, option
+from stereo_sfm.drivers.options import SourceOptions, option, read_size
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
-
-
-def _size(value: Any) -> tuple[int, int]:
-    width, _, height = value.partition("x") if isinstance(value, str) else (str(value[0]), "", str(value[1]))
-    if not (width.isdigit() and height.isdigit() and 64 <= int(width) <= 4096 and 64 <= int(height) <= 4096):
-        raise ValueError("WIDTHxHEIGHT, such as 640x400 or 1280x800")
-    return int(width), int(height)
 
 
 @dataclass(frozen=True)
 class OakOptions(SourceOptions):
     """Options of `oak`, `oak:ID` and `oak:ADDRESS`."""
 
-    size: tuple[int, int] = option((640, 400), "WIDTHxHEIGHT of the images", read=_size)
+    size: tuple[int, int] = option((640, 400), "WIDTHxHEIGHT of the images", read=read_size)
     fps: float = option(30.0, "images per second", low=1, high=120)
     exposure: int | None = option(None, "microseconds; auto: by the camera", low=20, high=33_000)
     iso: int = option(400, "with manual exposure", low=100, high=1600)

@@ -215,29 +215,6 @@ class Tilted(RadTan):
     coefficients: ClassVar[tuple[str, ...]] = (*RadTan.coefficients, "s1", "s2", "s3", "s4", "tau_x", "tau_y")
     slots: ClassVar[tuple[int, ...]] = (*RadTan.slots, *range(MORE, MORE + 6))
 
-    @classmethod
-    def _gain(cls, distortion: tuple[float, ...]) -> float:
-        """The focal length of the model's publication over that of the centre."""
-        return 1.0
-
-    @classmethod
-    def published(
-        cls, width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...] = ()
-    ) -> Self:
-        """The camera with focal lengths as the model's publication and other programs have them.
-
-        Raises:
-            ZeroDivisionError: coefficients of no lens.
-        """
-        gain = cls._gain(distortion)
-        return cls(width, height, fx / gain, fy / gain, cx, cy, distortion)
-
-    @property
-    def published_focal(self) -> tuple[float, float]:
-        """(fx, fy) as `published` takes them."""
-        gain = self._gain(self.distortion)
-        return self.fx * gain, self.fy * gain
-
     def _derive(self, p: F64) -> None:
         p[TILT : TILT + 9] = _tilt(*p[MORE + 4 : MORE + 6].tolist()).ravel()
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from stereo_sfm.calib.lens_doubts import doubts
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.start import ADVICE, check_start
+from stereo_sfm.calib.start import check_start
+from stereo_sfm.calib.sticking import positions, with_sticking
 from stereo_sfm.drivers.folder_source import FolderSource
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
@@ -253,11 +254,12 @@ def _against_calibration(source: Source) -> list[str]:
     """What the first images say against the calibration, as at the start of a run."""
     try:
         found = check_start(source.rig, source)
+        found = with_sticking(found, source.rig, source.at(positions(source.frame_count)))
     except StereoSfmError as error:
         return [str(error)]
     if not found.shown:
         return []
-    return [found.text if found.rig is None else f"{found.text}: a run corrects it at its start; {ADVICE}"]
+    return [found.text if found.rig is None else f"{found.text}: a run corrects it at its start; {found.advice}"]
 
 
 def _shows_nothing(image: StereoImage) -> str:

@@ -13,6 +13,7 @@ import pytest
 import stereo_sfm as s
 from stereo_sfm.calib.start import check_start
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 
 Change = Callable[[s.StereoImage], s.StereoImage]
 
@@ -115,3 +116,47 @@ def test_noise_corrects_nothing(pair: tuple[s.Rig, list[s.StereoImage]]) -> None
     rng = np.random.default_rng(3)
     noise = [rng.integers(0, 255, (2, *images[0].left.shape), np.uint8) for _ in range(13)]
     assert check_start(rig, [replace(images[0], left=a, right=b) for a, b in noise]).rig is None
+
+
+def misread(camera: Camera, model: type[Camera]) -> Camera:
+    """The numbers of a lens under the name of another model; a pinhole has no coefficients."""
+    distortion = () if model is Pinhole else camera.distortion
+    return model(*camera.size, camera.fx, camera.fy, camera.cx, camera.cy, distortion)
+
+
+@pytest.mark.parametrize("cameras", ["both", "left"])
+@pytest.mark.parametrize(("name", "wrong_model"), [("store_walk", RadTan), ("euroc_mh01", KannalaBrandt)])
+def test_a_lens_under_the_name_of_another_model(
+    data_root: Path, name: str, wrong_model: type[Camera], cameras: str
+) -> None:
+    with s.open_source(data_root / name) as source:
+        rig, images = source.rig, list(islice(source, 13))
+    assert rig.right is not None
+    right = misread(rig.right, wrong_model) if cameras == "both" else rig.right
+    found = check_start(replace(rig, left=misread(rig.left, wrong_model), right=right), images)
+    assert found.shown and f"contradict the lens model {wrong_model.model}" in found.text
+    assert found.rig is not None and found.rig.right is not None
+    assert (found.rig.left.model, found.rig.right.model) == (rig.left.model, rig.right.model)
+    assert check_start(found.rig, images).text == ""
+
+
+@pytest.mark.parametrize("name", ["store_walk", "euroc_mh01"])
+def test_a_lens_without_its_distortion_is_no_pass(data_root: Path, name: str) -> None:
+    with s.open_source(data_root / name) as source:
+        rig, images = source.rig, list(islice(source, 13))
+    assert rig.right is not None
+    found = check_start(replace(rig, left=misread(rig.left, Pinhole), right=misread(rig.right, Pinhole)), images)
+    assert found.shown and found.rig is None  # no coefficients are known that a run could use
+    assert "rows are off by" in found.text and "stereo-sfm calibrate" in found.text
+
+
+def test_coefficients_in_another_programs_order(data_root: Path) -> None:
+    with s.open_source(data_root / "euroc_mh01") as source:
+        rig, images = source.rig, list(islice(source, 13))
+    assert rig.right is not None
+    left, right = (
+        RadTan(*c.size, c.fx, c.fy, c.cx, c.cy, (*c.distortion[:2], 0.1, *c.distortion[2:4]))
+        for c in (rig.left, rig.right)
+    )
+    found = check_start(replace(rig, left=left, right=right), images)
+    assert found.shown and "radtan with k3 before p1 and p2" in found.text

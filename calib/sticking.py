@@ -1,0 +1,174 @@
+"""Places that stick to the image: projector dots, dirt on a lens, the robot's own edge, text drawn into the images.
+
+Windows of a few images, far enough apart for the camera to have moved, are compared at the same pixels. Pairs of images
+count in which most of the view changes everywhere: neither a camera at rest nor somebody who passes it does that. What
+looks the same in nearly all of them belongs to the camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from stereo_sfm.calib.mask import half_size, uncovered
+from stereo_sfm.calib.mask_search import (
+    CONTOUR_PX,
+    DARK,
+    MIN_VOTES,
+    WINDOW,
+    FixedVotes,
+    Moments,
+    moments,
+)
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.start import StartFinding
+from stereo_sfm.types import U8, Bool, StereoImage
+
+IMAGES, WITHIN = 8, 150  # looked at, among so many first ones; they are denser in the beginning
+PAIRS_BEFORE_NOTHING = 3  # images that show nothing in so many pairs end the search
+CELLS = 8  # of the image, in each direction
+STRONG = 12.0  # grey levels, standard deviation in windows that tell whether the view changes: no noise hides them
+CHANGED, CHANGED_CELLS = 0.02, 0.5  # of a cell's windows, and of the cells that have such windows
+MIN_WINDOWS = WINDOW * WINDOW // 2  # connected, of a part: half of those that show a spot of one pixel
+LEAST = 1e-3  # of the image; less than a robot's edge or a drop hides is chance
+CORNER_PX, MIN_ROUND = 9, 0.1  # px, and ratio of the squared gradients across: less is an edge
+MOVING = 0.75  # of the pairs, in which the view of a camera changes that does not rest for half of the images
+GAP_PX = 3  # between a part and what lies around it: windows that show both
+SAME_AROUND = 0.4  # of the windows around a part; as many look the same by chance and texture
+MIN_LEFT = 0.3  # of the image, where a tracked window shows nothing that sticks: with less, nothing can be masked
+TRACKED_PX = 7  # half of a tracked window, in the half-size image
+MASK = "'stereo-sfm mask SOURCE -o mask.png' writes a mask for all its recordings"
+
+
+def positions(count: int | None) -> list[int]:
+    """Of the images to look at, ascending; `count` is the number of images, None if it is not known."""
+    last = min(count or WITHIN, WITHIN) - 1
+    return sorted({round(last * (k / (IMAGES - 1)) ** 1.5) for k in range(IMAGES)})
+
+
+def sticking(images: Iterable[StereoImage]) -> list[Bool]:
+    """(H, W) of each camera, True where something sticks to the image; empty if nothing does, or they cannot tell.
+
+    Args:
+        images: of the same cameras, in order; no more are read than needed.
+    """
+    cameras: list[_Camera] = []
+    for image in images:
+        views = [image.left] if image.right is None else [image.left, image.right]
+        cameras = cameras or [_Camera() for _ in views]
+        for camera, view in zip(cameras, views, strict=False):
+            camera.add(view)
+        if all(camera.empty for camera in cameras):
+            return []
+    if not all(camera.moves for camera in cameras):
+        return []
+    parts = [camera.part() for camera in cameras]
+    return parts if any(part.any() for part in parts) else []
+
+
+def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
+    """What the start check found of a calibration, with what sticks to these images; its rig has masks of that.
+
+    Raises:
+        StereoSfmError: of the images.
+    """
+    parts = sticking(images)
+    if not parts:
+        return finding
+    shares = [
+        f"{100 * part.mean():.1f} % of the {side} image"
+        for part, side in zip(parts, ("left", "right"), strict=False)
+        if part.any()
+    ]
+    text = f"{' and '.join(shares)} sticks to the image while the rest moves (projector dots, dirt, the robot itself)"
+    masked = without_sticking(finding.rig or rig, parts)
+    if masked is None:
+        text = f"{text}: too much to be masked: turn the projector off, or clean the lens"
+    if finding.text:
+        known = masked if finding.rig is not None else None
+        return replace(finding, text=f"{finding.text}; and {text}", rig=known or finding.rig, shown=True)
+    return replace(finding, text=text, rig=masked, shown=True, advice=MASK)
+
+
+def without_sticking(rig: Rig, parts: Sequence[Bool]) -> Rig | None:
+    """The rig with masks of these places too; None if they leave too little of an image."""
+    own = (rig.left_mask, rig.right_mask)
+    masks = [
+        uncovered(~part, CONTOUR_PX) & (True if mask is None else mask) for part, mask in zip(parts, own, strict=False)
+    ]
+    if any(uncovered(half_size(mask), TRACKED_PX).mean() < MIN_LEFT for mask in masks):
+        return None
+    return replace(rig, left_mask=masks[0], right_mask=masks[1] if len(masks) > 1 else rig.right_mask)
+
+
+class _Camera:
+    """What all counted pairs of one camera's images have in common."""
+
+    def __init__(self) -> None:
+        self._seen: list[tuple[Moments, Bool]] = []
+        self._votes: FixedVotes | None = None
+
+    def add(self, image: U8) -> None:
+        new, corners = moments(image), _corners(image)
+        self._votes = self._votes or FixedVotes(new.deviation.shape)
+        for old, old_corners in self._seen:
+            if _view_changes(*old.compared(new, STRONG)):
+                both = corners & old_corners
+                textured, matching = old.compared(new)
+                self._votes.add(textured & both, matching & both)
+        self._seen.append((new, corners))
+
+    @property
+    def empty(self) -> bool:
+        """Whether enough pairs were compared to know that nothing sticks."""
+        pairs = self._votes.pairs if self._votes is not None else 0
+        return pairs >= PAIRS_BEFORE_NOTHING and not self.part(PAIRS_BEFORE_NOTHING).any()
+
+    @property
+    def moves(self) -> bool:
+        """Whether the view changes in most pairs: something that passes a camera at rest changes it in some."""
+        pairs = len(self._seen) * (len(self._seen) - 1) // 2
+        return self._votes is not None and self._votes.pairs > MOVING * pairs
+
+    def part(self, min_votes: int = MIN_VOTES) -> Bool:
+        """(H, W) what the windows that stay cover, off the rim of what is dark, such as a fisheye's: no corners lie
+        there; nothing if it is too small."""
+        assert self._votes is not None
+        brightest = np.maximum.reduce([one.mean for one, _ in self._seen])
+        lit = uncovered(brightest > DARK * np.median(brightest), WINDOW)
+        windows = _parts(self._votes.fixed(min_votes), lit, self._votes)
+        return ~uncovered(~windows, WINDOW // 2) if windows.mean() > LEAST else np.zeros_like(windows)
+
+
+def _view_changes(textured: Bool, matching: Bool) -> bool:
+    """Whether a part of most cells that have texture (H, W) does not match."""
+    share, changed = (
+        np.asarray(cv2.resize(one.astype(np.float32), (CELLS, CELLS), interpolation=cv2.INTER_AREA))
+        for one in (textured, textured & ~matching)
+    )
+    telling = share > CHANGED
+    return bool(telling.any()) and float((changed > CHANGED)[telling].mean()) > CHANGED_CELLS
+
+
+def _corners(image: U8) -> Bool:
+    """(H, W) what is no straight edge: one along the motion shows the same for as long as the camera drives."""
+    eigen = np.asarray(cv2.cornerEigenValsAndVecs(image, CORNER_PX, 3))[..., :2]
+    return eigen.min(-1) > MIN_ROUND * eigen.max(-1)
+
+
+def _parts(stays: Bool, lit: Bool, votes: FixedVotes) -> Bool:
+    """The parts of enough windows that end sharply: around what sticks, the view changes as it does everywhere.
+
+    Far scenery ahead of a camera that drives straight on stays, too, but what lies around it stays nearly as well.
+    """
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((stays & lit).astype(np.uint8))
+    near = uncovered(~stays, GAP_PX) & lit
+    around = cv2.dilate(labels.astype(np.float32), np.ones((2 * (GAP_PX + WINDOW) + 1,) * 2, np.uint8)).astype(np.int32)
+    seen, same = (
+        np.bincount(around[near], weights=one[near], minlength=len(stats)) for one in (votes.votes, votes.matching)
+    )
+    kept = (stats[:, cv2.CC_STAT_AREA] >= MIN_WINDOWS) & (same <= SAME_AROUND * seen)
+    return np.isin(labels, np.flatnonzero(kept)[np.flatnonzero(kept) > 0])
