@@ -24,8 +24,8 @@ class HostClock:
 
     The offset is that of the image with the shortest delay among the newest ones. A step of the wall clock changes only
     the wall clock times computed after it. Where an image would be older than a camera can hold it back, its source
-    does not keep the rate of its stamps, and the estimate begins anew. A source that is not live has no clock that runs with this computer's: where
-    it is slower than its stamps say, each image is as old as its arrival.
+    does not keep the rate of its stamps, and the estimate begins anew. A source that is not live has no clock that runs
+    with this computer's: where it is slower than its stamps say, each image is as old as its arrival.
     """
 
     def __init__(self) -> None:

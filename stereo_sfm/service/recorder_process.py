@@ -64,7 +64,7 @@ def run_recorder(messages: Connection, to_main: Connection) -> None:
 
 
 def _next(messages: Connection) -> object | None:
-    """The next message; None when the service has closed the pipe. Errors of what is done with it are another matter."""
+    """The next message; None when the service has closed the pipe."""
     try:
         return messages.recv()
     except (EOFError, OSError):

@@ -18,4 +18,6 @@ with ignored_by_children():
 
 def test_signals_stay_blocked_while_the_first_child_starts() -> None:
     out = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True).stdout
-    assert {int(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)} <= {int(s) for s in out.strip()[1:-1].split(",")}
+    assert {int(s) for s in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)} <= {
+        int(s) for s in out.strip()[1:-1].split(",")
+    }
