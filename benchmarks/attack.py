@@ -292,15 +292,17 @@ def many_saves(t: Target) -> Outcome:
     """the map is saved by four clients again and again"""
     given = {"Content_Type": "application/json", "X_Stereo_Sfm": "1", "Authorization": BEARER + t.token}
 
-    def save(_: int) -> tuple[float, bool]:
+    def save(_: int) -> tuple[float, bool, str]:
         begin = time.monotonic()
         code, said = t.tell("/api/command/save_map", "POST", b"{}", **given)
-        return time.monotonic() - begin, code == 200 and json.loads(said)["ok"]
+        reply = json.loads(said) if code == 200 else {"ok": False, "text": said or "no reply"}
+        return time.monotonic() - begin, reply["ok"], reply["text"]
 
     with ThreadPoolExecutor(4) as pool:
         replies = list(pool.map(save, range(16)))
-    saved = sum(ok for _, ok in replies)
-    return f"{saved} of {len(replies)} saved, the slowest in {max(s for s, _ in replies):.1f} s", saved == len(replies)
+    saved, others = sum(ok for _, ok, _ in replies), sorted({text for _, ok, text in replies if not ok})
+    slowest = max(seconds for seconds, _, _ in replies)
+    return f"{saved} of {len(replies)} saved, the slowest in {slowest:.1f} s {' '.join(others)}", not others
 
 
 def group_signal(t: Target) -> Outcome:
