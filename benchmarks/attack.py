@@ -1,6 +1,6 @@
 """Attacks on a running service and hostile files for its commands, from this computer alone: what became of each.
 
-    python -m benchmarks attack -- [--only WORD] [--requests N]
+    python -m benchmarks attack -- [--only WORD] [--requests N] [--busy N]
 
 A service plays the bundled recording with the page, Foxglove and the pose socket on. Each attack is carried out for
 real and its row says what happened; between two attacks a client with the token must still get poses. Files are given
@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,7 @@ STOP_S = 5.0
 MOST_MB = 600  # of a command that reads a hostile file
 HANG_S = 300.0  # by the clock: the computer may be busy, and a command has fifty seconds of processor time
 BEARER = "Bearer "
+DEMO = ROOT / "recordings" / "demo.mcap"
 
 WRITER = """
 import sys
@@ -286,10 +288,50 @@ def hostile_files(t: Target) -> Outcome:
     return "; ".join(wrong) or f"{len(commands)} commands, one line each, {most:.0f} MB at most", not wrong
 
 
+def many_saves(t: Target) -> Outcome:
+    """the map is saved by four clients again and again"""
+    given = {"Content_Type": "application/json", "X_Stereo_Sfm": "1", "Authorization": BEARER + t.token}
+
+    def save(_: int) -> tuple[float, bool, str]:
+        begin = time.monotonic()
+        code, said = t.tell("/api/command/save_map", "POST", b"{}", **given)
+        reply = json.loads(said) if code == 200 else {"ok": False, "text": said or "no reply"}
+        return time.monotonic() - begin, reply["ok"], reply["text"]
+
+    with ThreadPoolExecutor(4) as pool:
+        replies = list(pool.map(save, range(16)))
+    saved, others = sum(ok for _, ok, _ in replies), sorted({text for _, ok, text in replies if not ok})
+    slowest = max(seconds for seconds, _, _ in replies)
+    return f"{saved} of {len(replies)} saved, the slowest in {slowest:.1f} s {' '.join(others)}", not others
+
+
+def group_signal(t: Target) -> Outcome:
+    """SIGTERM to the whole process group while another service starts"""
+    slowest, killed = 0.0, 0
+    for delay in (0.5, 1.0, 1.5, 2.0, 3.0):
+        with tempfile.TemporaryDirectory(prefix="attack") as name:
+            other = Target(Path(name), _free_port(), _free_port(), _free_port(), 0, t.process)
+            command = [sys.executable, "-m", "stereo_sfm.cli", "serve", str(DEMO), *_settings(other)]
+            process = subprocess.Popen(
+                command, env=_environment(other.folder), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                start_new_session=True,
+            )  # fmt: skip
+            time.sleep(delay)
+            os.killpg(process.pid, signal.SIGTERM)
+            begin = time.monotonic()
+            said = process.communicate(timeout=60)[0]
+            slowest = max(slowest, time.monotonic() - begin)
+            killed += "ended (exit code" in said or "Traceback" in said
+    return (
+        f"slowest end {slowest:.1f} s, {killed} with a process killed or a traceback",
+        slowest <= STOP_S and not killed,
+    )
+
+
 ATTACKS: tuple[Callable[[Target], Outcome], ...] = (
     foreign_page, without_a_token, a_link_twice, idle_connections, silent_connections, slow_handshakes,
     clients_that_never_read, guesses, hostile_requests, a_map_over_recordings, files_of_others, two_writers,
-    hostile_files,
+    hostile_files, many_saves, group_signal,
 )  # fmt: skip
 
 
@@ -326,7 +368,7 @@ def running(requests: int) -> Iterator[Target]:
     with tempfile.TemporaryDirectory(prefix="attack") as name:
         folder = Path(name)
         target = Target(folder, _free_port(), _free_port(), _free_port(), requests, None)  # type: ignore[arg-type]
-        source = str(ROOT / "recordings" / "demo.mcap")
+        source = str(DEMO)
         with (folder.with_name(f"{folder.name}.log")).open("w+") as log:
             target.process = subprocess.Popen(
                 [sys.executable, "-m", "stereo_sfm.cli", "serve", source, *_settings(target)],
@@ -351,6 +393,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", metavar="WORD", help="attacks whose name has this word")
     parser.add_argument("--requests", type=int, default=2000, metavar="N", help="hostile requests")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside it")
     args = parser.parse_args()
     rows: list[tuple[str, str, bool]] = []
 
@@ -358,7 +401,10 @@ def main() -> int:
         rows.append((name, what, closed))
         print(f"{name:58}  {'closed' if closed else 'OPEN':6}  {what}", flush=True)
 
-    with running(args.requests) as target:
+    with ExitStack() as beside, running(args.requests) as target:
+        for _ in range(args.busy):
+            loop = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            beside.callback(loop.kill)
         for attack in ATTACKS:
             name = (attack.__doc__ or attack.__name__).strip()
             if args.only in name:

@@ -16,7 +16,7 @@ from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.other_camera import widest
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
-from stereo_sfm.mapping.bundle import bundle_adjust
+from stereo_sfm.mapping.bundle import BundleResult, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap, joined, restore_map
@@ -169,11 +169,19 @@ def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:
 def full_adjustment(map_: Map, rigs: Mapping[int, Rig], config: MapperConfig) -> None:
     """Bundle adjustment of the whole map with the mapper's settings, the first keyframe fixed.
 
+    Args: rigs, by the ids of the keyframes that they took.
+    """
+    result = adjust(map_, window.whole_map(map_), rigs, config)
+    log.info("full bundle adjustment: cost %.1f to %.1f", result.initial_cost, result.cost)
+
+
+def adjust(map_: Map, part: window.Window, rigs: Mapping[int, Rig], config: MapperConfig) -> BundleResult:
+    """Bundle adjustment of a part of the map with the mapper's settings.
+
     Outlier observations are removed afterwards, and points that too few keyframes still observe.
 
     Args: rigs, by the ids of the keyframes that they took.
     """
-    part = window.whole_map(map_)
     taken = [rigs[k] for k in map_.keyframes.kf_id[part.kf_rows].tolist()]
     number = {rig: i for i, rig in enumerate(dict.fromkeys(taken))}
     which = np.array([number[rig] for rig in taken], np.int64) if len(number) > 1 else None
@@ -181,7 +189,7 @@ def full_adjustment(map_: Map, rigs: Mapping[int, Rig], config: MapperConfig) ->
     result = bundle_adjust(list(number), bundle, window.bundle_config(config))
     window.write_back(map_, part, result)
     map_.cull_points(part.pt_rows[map_.points.obs_count[part.pt_rows] < config.min_observations])
-    log.info("full bundle adjustment: cost %.1f to %.1f", result.initial_cost, result.cost)
+    return result
 
 
 def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unseen_sessions: int = 0) -> SavedMap:

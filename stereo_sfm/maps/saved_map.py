@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stereo_sfm.arrays import read_arrays
+from stereo_sfm.arrays import read_arrays, write_arrays
 from stereo_sfm.calib.formats.native import read_native, rig_to_text, write_native
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
@@ -93,11 +93,14 @@ def map_files() -> frozenset[str]:
     return frozenset({"map.json", RIG, CAMERAS, *(f"{name}.npz" for name in _FILES)})
 
 
-def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | None = None) -> None:
+def save_map(
+    saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | None = None, compress: bool = True
+) -> None:
     """Write a map folder atomically; other files in it stay.
 
     Args:
         saved: the map. folder: where. beside: further files of the folder, by name.
+        compress: False where the processor is needed for more than the disk.
 
     Raises:
         StereoSfmError: the map is empty.
@@ -110,7 +113,7 @@ def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | 
         checksums: dict[str, str] = {}
         for name, columns in _FILES.items():
             path = draft / f"{name}.npz"
-            np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
+            write_arrays(path, {c: _column(saved, c) for c in columns}, compress)
             checksums[name] = checksum(path.read_bytes())
         write_native(saved.rig, draft / RIG)
         (draft / CAMERAS).write_text(cameras_text(saved.cameras, saved.session_ids), encoding="utf-8")

@@ -85,19 +85,15 @@ def update(
     if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
         raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
     session_of = dict(zip(both.snapshot.kf_ids.tolist(), both.sessions.tolist(), strict=True))
-    together, sessions = _snapshot(map_, session_of)
-    kept = ~_superseded(together, sessions)
-    forgotten = int((~kept).sum())
+    together, sessions = with_sessions(map_, session_of)
+    rest, _ = without_superseded(together, sessions)
+    forgotten = len(together.kf_ids) - len(rest.kf_ids)
     if forgotten:
-        obs = kept[together.obs_kf]
-        points = np.bincount(together.obs_pt[obs], minlength=len(together.pt_ids)) > 0
-        map_ = restore_for_merging(subset(together, kept, points, obs), mapper)
+        map_ = restore_for_merging(rest, mapper)
     full_adjustment(map_, dict(zip(both.snapshot.kf_ids.tolist(), rigs, strict=True)), mapper)
-    snapshot, kept_sessions = _snapshot(map_, session_of)
-    back = _back(saved.snapshot, snapshot)
-    new = _renumbered(_moved(snapshot, back))
+    snapshot, kept_sessions = with_sessions(map_, session_of)
     return Update(
-        SavedMap(new, both.cameras, vocabulary.id, kept_sessions),
+        SavedMap(in_frame_of(saved.snapshot, snapshot), both.cameras, vocabulary.id, kept_sessions),
         int(both.sessions[first_new]),
         loops,
         fused,
@@ -132,10 +128,25 @@ def _close(
     return fused
 
 
-def _snapshot(map_: Map, session_of: dict[int, int]) -> tuple[MapSnapshot, I64]:
+def with_sessions(map_: Map, session_of: dict[int, int]) -> tuple[MapSnapshot, I64]:
     """The map's content and the session of each of its keyframes."""
     snapshot = map_.snapshot()
     return snapshot, np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
+
+
+def without_superseded(together: MapSnapshot, sessions: I64) -> tuple[MapSnapshot, I64]:
+    """The map without keyframes whose view enough later sessions have had, and the session of each of the others."""
+    kept = ~_superseded(together, sessions)
+    if kept.all():
+        return together, sessions
+    obs = kept[together.obs_kf]
+    points = np.bincount(together.obs_pt[obs], minlength=len(together.pt_ids)) > 0
+    return subset(together, kept, points, obs), sessions[kept]
+
+
+def in_frame_of(before: MapSnapshot, after: MapSnapshot) -> MapSnapshot:
+    """A map that goes on from another one: in its frame, with ids from 0 on."""
+    return _renumbered(_moved(after, _back(before, after)))
 
 
 def _superseded(s: MapSnapshot, sessions: I64) -> Bool:

@@ -66,6 +66,7 @@ class ProcessRun:
         opened: Callable[[], None] | None = None,
         images: Callable[[SlotImage], None] | None = None,
         silent_s: float | None = None,
+        pose_first: bool = False,
     ) -> None:
         """Prepare a run.
 
@@ -82,11 +83,13 @@ class ProcessRun:
             opened: called when the source is open, before anything is written.
             images: takes each image in place of a log, and calls `release` when it was read.
             silent_s: a stage that does not respond for so long ends the run; None: it is only reported.
+            pose_first: begin with a live camera's images as soon as there are poses; the map follows.
         """
         self._opener, self._config, self._sinks = opener, config, list(sinks)
         self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
         self._folders, self._viewer = folders or MapFolders(), viewer
         self._opened, self._images, self._silent_s = opened, images, silent_s
+        self._pose_first = pose_first
         self._stages = StageProcesses(config.pipeline.threads)
         self._outer = OuterEnds()
         self._live = False  # the logger is never waited for
@@ -283,6 +286,8 @@ class ProcessRun:
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         if not self._live:
             self._held["mapper"] = [setup]
+        elif self._pose_first:
+            self._held |= {stage: [setup] for stage in ("mapper", "loop", "optimizer")}
         for stage in self._stages.processes.keys() - self._held.keys():
             self._stages.request(stage, (setup, jpeg) if stage == "capture" else setup)
         self._set_up_sent = True
@@ -292,7 +297,7 @@ class ProcessRun:
     def _begin(self, stage: str) -> None:
         """Start capture when the tracker is ready, of a live camera when every stage is: its images do not wait.
 
-        Until the tracker is ready, the mapper leaves it the processor.
+        Until the tracker is ready, the mapper leaves it the processor; where poses come first, so do the others.
         """
         self._not_ready.discard(stage)
         if not self._not_ready:
@@ -302,7 +307,8 @@ class ProcessRun:
                 for request in requests:
                     self._stages.request(held, request)
             self._held.clear()
-        if not self._capturing and not (self._not_ready if self._live else {"tracker"} & self._not_ready):
+        waited_for = self._not_ready if self._live and not self._pose_first else {"tracker"}
+        if not self._capturing and not waited_for & self._not_ready:
             self._capturing = True
             self._stages.request("capture", "go")
 
@@ -320,8 +326,10 @@ class ProcessRun:
             arrived = wait([connection], CHECK_S)
             if self._stopped_s is not None and time.monotonic() - self._stopped_s > STOP_GRACE_S:
                 raise KeyboardInterrupt  # heartbeats keep arriving
+            silent = self._watchdog.silent(["capture"])
+            if silent and self._silent_s is not None:
+                raise StageDied("the capture process does not respond")
             if not arrived:
-                self._watchdog.silent(["capture"])
                 continue
             try:
                 message = connection.recv()

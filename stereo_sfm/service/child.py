@@ -11,11 +11,13 @@ import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any, NoReturn
+from typing import Any
 
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS, ignored_by_children
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.pipeline.threads import thread_environment
+
+TIDY_S = 0.6  # for the libraries of an output to clean up, of the second that it has for its end
 
 Send = Callable[[object], None]
 
@@ -49,8 +51,10 @@ def end_with_service() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-def run_child(name: str, to_service: Connection, body: Callable[[Send], None]) -> NoReturn:
+def run_child(name: str, to_service: Connection, body: Callable[[Send], None], tidy: bool = False) -> None:
     """In the child: run its body with a function that sends to the service, then end the process.
+
+    Args: tidy, libraries clean up after themselves at the interpreter's exit, as far as they do that in time.
 
     Stop signals are the service's to handle. Lines of the package's logger are sent as `LogLine`, with the name.
     """
@@ -65,4 +69,8 @@ def run_child(name: str, to_service: Connection, body: Callable[[Send], None]) -
     logging.getLogger(LOGGER).setLevel(logging.INFO)
     with Listener(name, send):
         body(send)
-    os._exit(0)  # a server's threads, or one that waits for the disk, may be left
+    if not tidy:
+        os._exit(0)  # a thread that waits for the disk may be left
+    end = threading.Timer(TIDY_S, os._exit, (0,))  # so may a server's
+    end.daemon = True
+    end.start()

@@ -54,7 +54,12 @@ class MapConfig:
         MAP_MODES,
         "Continue the saved map or begin it, localize in it without changing it, begin a new one, or keep none",
     )
-    save_every_min: float = number(5.0, 0.05, 1440, "Minutes between two saves while running; the first is after one")
+    save_every_min: float = number(
+        5.0,
+        0.05,
+        1440,
+        "Most minutes between two saves; a new session is saved more often",
+    )
 
 
 @dataclass(frozen=True)

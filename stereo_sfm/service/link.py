@@ -201,7 +201,7 @@ def run_output(
                 publisher.put(pickle.loads(messages.recv_bytes()))
         publisher.close()
 
-    run_child(f"output {module.partition(':')[0].rpartition('.')[2]}", to_main, body)
+    run_child(f"output {module.partition(':')[0].rpartition('.')[2]}", to_main, body, tidy=True)
 
 
 def make_publisher(module: str, config: RobotConfig) -> Publisher:

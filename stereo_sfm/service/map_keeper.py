@@ -21,7 +21,8 @@ log = logging.getLogger("stereo_sfm")
 
 SAVE_S = 25.0  # for the reply to a request to save: the save itself goes on
 ENDING = "the service is ending: the map is saved with it"
-FIRST_SAVE_MIN = 1.0  # the first save of a session comes earlier than the interval
+FIRST_SAVE_MIN = 1.0  # minutes to the first save of a session
+SHARE_OF_AGE = 0.5  # of the age of a session until its next save, up to the interval of the configuration
 SETTLE_S = 20.0  # for the map of a session to be saved before a restart on request
 
 
@@ -35,17 +36,16 @@ class MapKeeper:
         self._next_folder: Path | None = None  # the map of the next session, if another one
         self.is_new = False  # the saved map begins with this session
         self._next_save_s = float("inf")
-        self._began_ns = 0  # Unix time of the session's beginning
+        self._began_ns, self._began_s = 0, 0.0  # Unix and monotonic time of the session's beginning
         self._session_saved = threading.Event()  # the session's part is complete on disk
+        self._session = 0  # number of the one that runs
         self._asked = self._answered = 0  # requests to the session to write its part, and its replies, in order
-        self._joining = 0  # the reply whose part is being added to the saved map
-        self._wanted = 0  # the request that a caller waits for
-        self._written = threading.Event()  # which has ended
-        self._failure = ""  # why it is not saved
-        self._requests = threading.Lock()
-        self._lock = threading.Lock()  # of the store, while it changes
+        self._ended = 0  # of the requests: saved, or not
+        self._again = False  # somebody asked while a save was under way: another one follows, for all of them
+        self._failure = ""  # of the last one
+        self._lock = threading.Condition(threading.Lock())  # of the store and of these, while they change
         self._ending = False
-        self._awaited = False  # the last save was requested, and the session has not replied
+        self._last = False  # the last save was requested
         self._before: tuple[int, int] | None = None  # what was written at that request
 
     @property
@@ -67,6 +67,11 @@ class MapKeeper:
     def exists(self) -> bool:
         """Whether there is a saved map."""
         return (self.folder / "map.json").exists()
+
+    @property
+    def _awaited(self) -> bool:
+        """Whether the session has not replied to the last request."""
+        return self._last and self._answered < self._asked
 
     @property
     def pid(self) -> int | None:
@@ -97,25 +102,26 @@ class MapKeeper:
                 self._store = MapStore(self._next_folder, self.mode, self._store.config, _fresh=extends)
                 self._next_folder = None
             folders = self._store.begin()
-            self._asked = self._answered = self._joining = self._wanted = 0
+            self._asked = self._answered = self._ended = 0
+            self._again = False
+            self._session += 1
+            self._end_request("the pipeline was started again: save once more")
         self.is_new = folders.map_in is None
-        self._began_ns = time.time_ns()
+        self._began_ns, self._began_s = time.time_ns(), time.monotonic()
         self._session_saved.clear()
-        self._schedule(min(FIRST_SAVE_MIN, self.save_every_min))
+        self._schedule()
         return folders
 
     def session_saved(self, message: MapSaved) -> None:
         """The session's part is on disk, or cannot be: the saved map follows from it."""
-        self._awaited = False
         with self._lock:
             self._answered += 1
             if not message.why:
                 self._session_saved.set()
                 if not self._ending:
                     self._store.join()
-                    self._joining = self._answered
                 return
-            self._end_request(message.why, self._answered)
+            self._end_request(message.why)
         log.log(logging.WARNING if message.keyframes else logging.INFO, "the map was not saved: %s", message.why)
 
     def finish(self, until_s: float, complete: bool) -> None:
@@ -139,6 +145,8 @@ class MapKeeper:
             return
         self._store.join()
         joined = self._store.joined(max(until_s - time.monotonic(), 0.0))
+        while joined is not None and self._store.joining:  # an earlier one may have read a folder that was replaced
+            joined = self._store.joined(max(until_s - time.monotonic(), 0.0))
         if joined is None:
             self._store.cancel()
             log.warning("the map of this session is added to %s at the next start", self.folder)
@@ -156,8 +164,7 @@ class MapKeeper:
             self._ending = True
             self._end_request(ENDING)
             if self._store.saves and session is not None:
-                self._store.cancel()
-                self._awaited, self._before = True, self._store.written()
+                self._last, self._before = True, self._store.written()
                 self._ask(session, urgent=True)
 
     def check(self, session: Session | None) -> None:
@@ -187,21 +194,21 @@ class MapKeeper:
         copy = self.beside(name) if name else None
         if copy is not None and copy.exists() and not (copy / "map.json").exists():
             return Reply(False, f"{copy} is no map: choose another name")
-        with self._requests:
-            with self._lock:
-                if self._ending:
-                    return Reply(False, ENDING)
-                self._written.clear()
-                self._failure = ""
+        with self._lock:
+            if self._ending:
+                return Reply(False, ENDING)
+            of, number = self._session, self._asked + 1  # the next one: a save under way may lack what was mapped last
+            if self._ended < self._asked:
+                self._again = True
+            else:
                 self._ask(session)
-                self._wanted = self._asked
-            if not self._written.wait(SAVE_S):
+            if not self._lock.wait_for(lambda: self._ending or self._session != of or self._ended >= number, SAVE_S):
                 without = f": there is no copy {name}" if name else ""
                 return Reply(False, f"the map is still being saved after {SAVE_S:.0f} s{without}")
             if self._failure:
                 return Reply(False, self._failure)
-            if copy is not None:
-                copy_map(self.folder, copy)
+        if copy is not None:
+            copy_map(self.folder, copy)
         return Reply(True, f"saved to {copy or self.folder}")
 
     def switch(self, folder: Path) -> None:
@@ -220,24 +227,32 @@ class MapKeeper:
 
     def _save_when_due(self, session: Session | None) -> None:
         """A save that takes longer than the interval is not interrupted by the next one."""
-        busy = self._answered < self._asked or self._store.joining
-        if session is not None and not busy and time.monotonic() >= self._next_save_s:
-            self._schedule(self.save_every_min)
+        if session is None or self._ended < self._asked:
+            return
+        due = time.monotonic() >= self._next_save_s
+        if due:
+            self._schedule()
+        if due or self._again:
+            self._again = False
             self._ask(session)
+        self._store.prepare()
 
     def _ask(self, session: Session, urgent: bool = False) -> None:
         self._asked += 1
         session.save_map(self._store.session, urgent)
 
     def _report_joined(self, joined: Joined) -> None:
-        self._end_request(joined.why, self._joining)
+        self._end_request(joined.why)
         if joined.why:
             log.warning("the map was not saved: %s", joined.why)
         else:
             _log_saved(self.folder, joined)
 
-    def _schedule(self, minutes: float) -> None:
-        self._next_save_s = time.monotonic() + 60 * minutes
+    def _schedule(self) -> None:
+        """The next save is the nearer, the younger the session is: each has about as much to add to what there is."""
+        age_min = (time.monotonic() - self._began_s) / 60
+        wait_min = min(max(FIRST_SAVE_MIN, SHARE_OF_AGE * age_min), self.save_every_min)
+        self._next_save_s = time.monotonic() + 60 * wait_min
 
     def _log_lost(self) -> None:
         at = time.strftime("%H:%M:%S", time.localtime(self.saved_ns / 1e9))
@@ -245,11 +260,10 @@ class MapKeeper:
         kept = f"{self.folder} holds it as of {at}" if saved else "it had not been saved before"
         log.error("the map of this session was NOT saved: it could not be written in time; %s", kept)
 
-    def _end_request(self, failure: str, number: int | None = None) -> None:
-        """Let a caller go on, if the end of request `number` is what it waits for; None: in any case."""
-        if number is None or number >= self._wanted:
-            self._failure = failure
-            self._written.set()
+    def _end_request(self, failure: str) -> None:
+        """Those who wait for the save under way go on."""
+        self._failure, self._ended = failure, self._asked
+        self._lock.notify_all()
 
 
 def _log_saved(folder: Path, joined: Joined) -> None:

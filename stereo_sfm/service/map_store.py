@@ -2,15 +2,18 @@
 
 While the service runs, two folders are beside the map's folder STORE: `.STORE.base`, the map that the session began
 with, and `.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into
-STORE, so that STORE is a complete map whenever the power fails. What was not joined at the end is joined at the next
-start. A service that changes STORE holds its lock as long as it runs: `map update` and the like have to wait.
+STORE as the session goes on, so that STORE is a complete map whenever the power fails. What was not joined at the end
+is joined at the next start. A service that changes STORE holds its lock as long as it runs: `map update` and the like
+have to wait.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shutil
+import threading
 import time
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -20,14 +23,18 @@ from pathlib import Path
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
+from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.growing import GrowingMap
 from stereo_sfm.maps.replace_folder import recover
+from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock
-from stereo_sfm.maps.unfinished import copy_map, publish
+from stereo_sfm.maps.unfinished import copy_map, load_place, publish
+from stereo_sfm.pipeline.child import NICENESS
 from stereo_sfm.service.child import end_with_service, pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
-NICE = 10
+NICE = NICENESS["loop"]  # of the search for loops, which that stage makes, too
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,9 @@ class MapStore:
     _base: Path | None = None
     _process: BaseProcess | None = None
     _result: Connection | None = None
+    _requests: Connection | None = None
+    _waiting: int = 0  # requests to join without a result
+    _died: bool = False  # the process ended by itself: the next request starts another one
     _done: Joined | None = None
     _fresh: bool = field(default=True)  # no session has begun yet
     _lock: FolderLock | None = None  # of the saved map, from the first session on
@@ -105,7 +115,7 @@ class MapStore:
         self._fresh = False
         shutil.rmtree(self.session, ignore_errors=True)
         shutil.rmtree(base, ignore_errors=True)
-        self._base = None
+        self._base, self._died = None, False
         if (self.folder / "map.json").exists():
             self.saved_ns = max(self.saved_ns, (self.folder / "map.json").stat().st_mtime_ns)
             copy_map(self.folder, base)
@@ -128,14 +138,25 @@ class MapStore:
         except (StereoSfmError, OSError) as error:
             log.warning("the last session could not be added to the saved map: %s", error)
 
+    def prepare(self) -> None:
+        """Start the process that joins, which loads the map that the session began with."""
+        if self._base is not None and self._process is None and not self._died:
+            (requests, self._requests), (self._result, send) = pipe(), pipe()
+            self._process = start_child(
+                "map saver", _keep_joined, self._base, self.session, self.folder, self.config, requests, send
+            )
+
     def join(self) -> None:
-        """Begin to write the saved map from the session's part: at once where it is all there is, else in a process."""
-        self.cancel()
+        """Begin to write the saved map from the session's part as it is now."""
         if self._base is None:
             self._done = _published(None, self.session, self.folder, self.config)
             return
-        self._result, send = pipe()
-        self._process = start_child("map saver", _publish, self._base, self.session, self.folder, self.config, send)
+        self._died = False
+        self.prepare()
+        self._waiting += 1
+        if self._requests is not None:
+            with contextlib.suppress(OSError):  # it was killed: its result says so
+                self._requests.send(None)
 
     @property
     def pid(self) -> int | None:
@@ -146,7 +167,7 @@ class MapStore:
     @property
     def joining(self) -> bool:
         """Whether the result of `join` has not been taken yet."""
-        return self._process is not None or self._done is not None
+        return self._waiting > 0 or self._done is not None
 
     def joined(self, timeout_s: float = 0.0) -> Joined | None:
         """The result of `join`, once; None while it runs."""
@@ -157,8 +178,12 @@ class MapStore:
             try:
                 result = self._result.recv()
             except (EOFError, OSError):
+                waited, self._died = self._waiting > 0, True
+                self.cancel()
+                if not waited:
+                    return None
                 result = Joined(why="the process that saves the map was killed")
-            self.cancel()
+            self._waiting = max(self._waiting - 1, 0)
         assert result is not None
         if not result.why:
             self.saved_ns = time.time_ns()
@@ -169,9 +194,11 @@ class MapStore:
         if self._process is not None:
             self._process.kill()
             self._process.join()
-        if self._result is not None:
-            self._result.close()
-        self._process = self._result = None
+        for end in (self._result, self._requests):
+            if end is not None:
+                end.close()
+        self._process = self._result = self._requests = None
+        self._waiting = 0
 
     def release(self) -> None:
         """Let others write to the saved map."""
@@ -185,10 +212,50 @@ class MapStore:
             shutil.rmtree(folder, ignore_errors=True)
 
 
-def _publish(base: Path | None, session: Path, out: Path, config: Config, send: Connection) -> None:
+def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests: Connection, send: Connection) -> None:
+    """Body of the process: joins the session's part on request; a thread of low priority looks for its loops."""
     end_with_service()
-    os.nice(NICE)
-    send.send(_published(base, session, out, config))
+    try:
+        growing = GrowingMap(load_map(base), configured_vocabulary(config.loop), config)
+    except (StereoSfmError, OSError) as error:
+        growing, why = None, str(error)
+    else:
+        why = ""
+    step, free, work = threading.Lock(), threading.Event(), threading.Event()
+    if growing is not None:
+        threading.Thread(target=_search, args=(growing, step, free, work), daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            free.set()
+            requests.recv()
+            free.clear()
+            with step:
+                send.send(Joined(why=why) if growing is None else _grown(growing, session, out))
+            work.set()
+
+
+def _search(growing: GrowingMap, step: threading.Lock, free: threading.Event, work: threading.Event) -> None:
+    """Work on the map whenever no request is carried out."""
+    if hasattr(os, "setpriority"):
+        thread = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + NICE)
+    while True:
+        work.wait()
+        free.wait()
+        with step:
+            work.clear()
+            if growing.work():
+                work.set()
+
+
+def _grown(growing: GrowingMap, session: Path, out: Path) -> Joined:
+    try:
+        growing.take(load_map(session), load_place(session))
+        saved = growing.saved()
+        save_map(saved, out)
+    except (StereoSfmError, OSError) as error:
+        return Joined(why=str(error))
+    return Joined(len(saved))
 
 
 def _published(base: Path | None, session: Path, out: Path, config: Config) -> Joined:

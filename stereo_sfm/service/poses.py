@@ -16,14 +16,16 @@ from stereo_sfm.types import F64, Frame, MapUpdate, TrackState
 TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED)
 KEPT_VERSIONS = 256  # of the map, which frames may still refer to
 WINDOW = 300  # images over which the delay from exposure to this computer is estimated
+BUFFERED_NS = 500_000_000  # most that a camera and its driver hold back: older, and the stamps do not run with time
 
 
 class HostClock:
     """The sensor's clock against this computer's clocks, from when images arrived.
 
     The offset is that of the image with the shortest delay among the newest ones. A step of the wall clock changes only
-    the wall clock times computed after it. A source that is not live has no clock that runs with this computer's: where
-    it is slower than its stamps say, each image is as old as its arrival.
+    the wall clock times computed after it. Where an image would be older than a camera can hold it back, its source
+    does not keep the rate of its stamps, and the estimate begins anew. A source that is not live has no clock that runs
+    with this computer's: where it is slower than its stamps say, each image is as old as its arrival.
     """
 
     def __init__(self) -> None:
@@ -35,7 +37,10 @@ class HostClock:
         """An image was handed over by its driver at a time of the monotonic clock."""
         if not self.live:
             self._offsets.clear()
-        self._offsets.append(int(captured_s * 1e9) - stamp_ns)
+        offset = int(captured_s * 1e9) - stamp_ns
+        if offset - min(self._offsets, default=offset) > BUFFERED_NS:
+            self._offsets.clear()
+        self._offsets.append(offset)
         self._captured[frame_id] = captured_s
         if len(self._captured) > WINDOW:
             del self._captured[next(iter(self._captured))]

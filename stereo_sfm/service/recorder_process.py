@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -57,12 +56,19 @@ def run_recorder(messages: Connection, to_main: Connection) -> None:
     def work(send: Send) -> None:
         body = _Body(send)
         with HeartbeatThread("recorder", body.beat):
-            with contextlib.suppress(EOFError, OSError):
-                while True:
-                    body.take(messages.recv())
+            while (message := _next(messages)) is not None:
+                body.take(message)
             body.finish()
 
     run_child("recorder", to_main, work)
+
+
+def _next(messages: Connection) -> object | None:
+    """The next message; None when the service has closed the pipe."""
+    try:
+        return messages.recv()
+    except (EOFError, OSError):
+        return None
 
 
 class _Body:
@@ -100,7 +106,10 @@ class _Body:
         self._next_open_s = time.monotonic() + AGAIN_S
         if self._ring is None:
             layout, slots, name = begin.ring
-            self._ring = ImageRing(layout, slots, name)
+            try:
+                self._ring = ImageRing(layout, slots, name)
+            except FileNotFoundError:
+                return  # the pipeline has died: the next one begins another recording
         try:
             self._recorder = SegmentRecorder(begin.policy, begin.rig, begin.config, begin.source, begin.opening)
             self._problem = ""

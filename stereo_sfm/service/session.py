@@ -75,6 +75,7 @@ class Session:
             folders=folders,
             images=self._image,
             silent_s=silent_s,
+            pose_first=number > 1,  # a robot may be moving
         )
 
     @property

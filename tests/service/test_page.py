@@ -62,7 +62,11 @@ def _recordings(folder: Path) -> dict[str, Reply]:
     return {
         "recordings": Reply(True, "", {"recordings": [row]}),
         "recording_files": Reply(True, "", {"files": [str(f) for f in files]}),
-        "status": Reply(True, "", {"settings": {"recording.mode": "off"}}),
+        "status": Reply(
+            True,
+            "",
+            {"settings": {"map.save_every_min": 5.0, "recording.quota_gb": 20.0, "recording.mark_losses": True}},
+        ),
         "save_map": Reply(False, "the disk is full"),
     }
 
@@ -109,7 +113,7 @@ def _plan() -> tuple[U8, float, tuple[float, float]]:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-@pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 844)])
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (768, 1024), (390, 844)])
 def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path: Path) -> None:
     service = FakeService(_recordings(tmp_path))
     with _serving(service) as output, Browser(width, height) as browser:
@@ -149,6 +153,17 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
             browser.run("document.getElementById('record').click()")
             browser.until("document.getElementById('reply').textContent === 'start_recording done'")
             browser.run("document.querySelector('[data-command=mark]').click()")
+            assert "save every min" not in text and "Most minutes between two saves" in text  # names, units and help
+            browser.run("document.querySelector('#settings input[role=switch]').click()")
+            browser.until("document.getElementById('reply').textContent === 'set_setting done'")
+            assert ("set_setting", {"name": "recording.mark_losses", "value": "false"}) in service.calls
+            press = "document.dispatchEvent(new KeyboardEvent('keydown', {key: '%s', bubbles: true}))"
+            before = browser.run("view.scale")
+            browser.run(press % "f")
+            browser.until(f"view.follow && view.scale > 2 * {before}")
+            browser.run(press % "0")
+            browser.until("!view.follow && view.zoom === 1")
+            assert browser.run("document.querySelectorAll('#history svg path').length") == 4
             browser.run("window.confirm = () => true; document.querySelector('[data-command=reset]').click()")
             buttons = "[...document.querySelectorAll('#recordings button')]"
             browser.run(f"{buttons}.find(b => b.textContent === 'files').click()")
@@ -167,6 +182,19 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
         assert ("delete_recording", {"id": "00007 <b>&1"}) in service.calls
         output.close()
         browser.until("document.getElementById('state').textContent === 'no connection'")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_link_logs_the_browser_in_once() -> None:
+    code = Links(TOKEN).new()
+    with _serving(rules=Access(TOKEN)) as output:
+        _show(output, 1)
+        for first in (True, False):
+            with Browser(800, 600) as browser:
+                browser.call("Page.navigate", url=f"http://127.0.0.1:{output.port}/#{code}")
+                shown = "document.getElementById('state').textContent === 'running'"
+                browser.until(shown if first else "!document.getElementById('login').hidden")
+                assert browser.run("location.hash") == ""  # nobody reads it over a shoulder, or in the history
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")

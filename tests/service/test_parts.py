@@ -155,6 +155,18 @@ def test_the_sensors_clock_is_that_of_the_fastest_image(monkeypatch: pytest.Monk
     assert len(clock._captured) <= 301  # pyright: ignore[reportPrivateUsage]
 
 
+def test_a_camera_that_does_not_keep_its_rate_does_not_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HostClock()
+    monkeypatch.setattr("time.monotonic_ns", lambda: int(1000e9))
+    monkeypatch.setattr("time.time_ns", lambda: int(1000e9))
+    ages: list[float] = []
+    for k in range(900):  # 30 Hz by its stamps, 10 Hz on this computer
+        at = 100.0 + k * 0.1
+        clock.image(k, k * 33 * MS, at)
+        ages.append(at - clock.unix_ns(k * 33 * MS) * 1e-9)
+    assert min(ages) > -1e-6 and max(ages) < 0.5 + 1e-6
+
+
 def test_the_cloud_forgets_what_the_mapper_removed() -> None:
     clouds: list[MapCloud] = []
     follower = MapCloudBuilder(1, clouds.append)

@@ -25,6 +25,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.outputs.access import Access, Bucket, Links, TooManyAttempts
 from stereo_sfm.service.outputs.door import HANDSHAKE_S
 from stereo_sfm.service.outputs.guard import Guard, refusal
+from stereo_sfm.service.page.settings_form import settings_form
 from stereo_sfm.service.page.state import PageState
 from stereo_sfm.service.page.verdicts import Verdicts
 from stereo_sfm.service.publisher import Reply, ServiceClient
@@ -148,7 +149,7 @@ class Page:
 
     async def _settings(self, request: Request) -> Response:
         reply = await self._call("status", {})
-        return JSONResponse(reply.data.get("settings", {}))
+        return JSONResponse(settings_form(reply.data.get("settings", {})))
 
     async def _recordings(self, request: Request) -> Response:
         reply = await self._call("recordings", {})

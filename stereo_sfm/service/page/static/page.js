@@ -4,6 +4,8 @@ const show = (id, text) => { if ($(id).textContent !== text) $(id).textContent =
 const number = (value, digits = 1) => value === null || value === undefined ? "–" : Number(value).toFixed(digits);
 const STATES = { running: "good", starting: "warn", lost: "bad", camera_gone: "bad", disk_full: "warn", stopping: "warn" };
 let plan = null, planVersion = 0;
+const view = { zoom: 1, x: null, y: null, follow: false, scale: 1 };  // of the plan; centre null: the whole map
+const HISTORY_S = 300, history_ = [];  // what the small plots show, one entry a second
 let live = null, map = { version: 0, points: [], path: [] }, last = null, receivedAt = 0, commands = 0;
 
 async function request(path, options) {
@@ -103,9 +105,13 @@ function drawPlan(state) {
     return [Math.min(...values), Math.max(...values)];
   };
   const [x0, x1] = range(0), [y0, y1] = range(1), margin = 24;
-  const scale = Math.min((canvas.width - 2 * margin) / Math.max(y1 - y0, 2), (canvas.height - 2 * margin) / Math.max(x1 - x0, 2));
+  const fit = Math.min((canvas.width - 2 * margin) / Math.max(y1 - y0, 2), (canvas.height - 2 * margin) / Math.max(x1 - x0, 2));
+  const scale = view.scale = fit * view.zoom;
+  if (view.follow && p) [view.x, view.y] = [p.x, p.y];
+  const [cx, cy] = view.x === null ? [(x0 + x1) / 2, (y0 + y1) / 2] : [view.x, view.y];
+  [view.cx, view.cy] = [cx, cy];
   // x forward is up, y left is left
-  const at = (x, y) => [canvas.width / 2 - (y - (y0 + y1) / 2) * scale, canvas.height / 2 - (x - (x0 + x1) / 2) * scale];
+  const at = (x, y) => [canvas.width / 2 - (y - cy) * scale, canvas.height / 2 - (x - cx) * scale];
   if (extent && plan) {
     g.imageSmoothingEnabled = false;
     g.drawImage(plan, ...at(extent.x, extent.y), extent.along_y * scale, extent.along_x * scale);
@@ -127,6 +133,76 @@ function drawPlan(state) {
   g.lineTo(12 + metres * scale, canvas.height - 12); g.stroke(); g.font = "16px system-ui";
   g.fillText(`${metres} m`, 12, canvas.height - 18);
 }
+
+function redraw() { if (last) drawPlan(last); }
+
+function zoom(factor) {
+  view.zoom = Math.max(0.5, Math.min(40, view.zoom * factor));
+  redraw();
+}
+
+function follow(on) {
+  $("follow").checked = view.follow = on;
+  if (on && view.zoom < 2) view.zoom = 4;
+  redraw();
+}
+
+function wholeMap() {
+  [view.zoom, view.x, view.y] = [1, null, null];
+  follow(false);
+}
+
+function prepareView() {
+  const canvas = $("plan");
+  canvas.onwheel = (event) => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2); };
+  canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
+  canvas.onpointermove = (event) => {
+    if (!event.buttons || view.cx === undefined) return;
+    const metres = canvas.width / canvas.clientWidth / view.scale;
+    [view.x, view.y] = [view.cx + event.movementY * metres, view.cy + event.movementX * metres];
+    follow(false);
+  };
+  $("zoom-in").onclick = () => zoom(1.5);
+  $("zoom-out").onclick = () => zoom(1 / 1.5);
+  $("fit").onclick = wholeMap;
+  $("follow").onchange = () => follow($("follow").checked);
+}
+
+function plot(name, values, text) {
+  const figure = document.createElement("figure"), caption = document.createElement("figcaption");
+  caption.textContent = `${name}: ${text}`;
+  const most = Math.max(...values, 1e-9), place = "http://www.w3.org/2000/svg";
+  const svg = document.createElementNS(place, "svg"), path = document.createElementNS(place, "path");
+  svg.setAttribute("viewBox", `0 0 ${HISTORY_S} 100`);
+  svg.setAttribute("preserveAspectRatio", "none");
+  const first = HISTORY_S - values.length;
+  path.setAttribute("d", values.map((v, k) => `${k ? "L" : "M"}${first + k} ${96 - 92 * v / most}`).join(""));
+  svg.append(path);
+  figure.append(caption, svg);
+  return figure;
+}
+
+function showHistory(state) {
+  const h = state.health, now = Math.floor(Date.now() / 1000);
+  if (!h || (history_.length && history_[history_.length - 1].at === now)) return;
+  const dropped = Object.values(h.dropped).reduce((a, b) => a + b, 0), speed = state.pose ? state.pose.speed || 0 : 0;
+  history_.push({ at: now, rate: h.rate_hz || 0, latency: h.latency_ms[1] || 0, dropped, speed });
+  if (history_.length > HISTORY_S) history_.shift();
+  const of = (key) => history_.map((entry) => entry[key]);
+  $("history").replaceChildren(
+    plot("Rate", of("rate"), `${number(h.rate_hz)} Hz`), plot("Latency, 95 %", of("latency"), `${number(h.latency_ms[1], 0)} ms`),
+    plot("Dropped images", of("dropped"), String(dropped)), plot("Speed", of("speed"), `${number(speed, 2)} m/s`));
+}
+
+const KEYS = { "+": () => zoom(1.5), "-": () => zoom(1 / 1.5), "0": wholeMap, f: () => follow(!view.follow),
+  r: () => $("record").click() };
+
+document.onkeydown = (event) => {
+  if (event.ctrlKey || event.altKey || event.metaKey || $("all").hidden) return;
+  if (["INPUT", "SELECT", "TEXTAREA"].includes(event.target.tagName)) return;
+  const made = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
+  if (made) made.click(); else if (Object.hasOwn(KEYS, event.key)) KEYS[event.key]();
+};
 
 function refreshPlan(extent) {
   if (!extent || extent.version === planVersion) return;
@@ -168,19 +244,47 @@ async function listFiles(id) {
   }));
 }
 
-function showSettings(values) {
-  const table = document.createElement("table");
-  table.id = "settings";
-  for (const [name, value] of Object.entries(values || {})) {
-    const field = document.createElement("input");
-    [field.value, field.ariaLabel] = [value, name];
-    const set = button("set", () => command("set_setting", { name, value: field.value }));
-    const both = document.createElement("span");
-    both.append(field, set);
-    row(table, [name, both]);
+function fieldOf(setting) {
+  const change = (value) => command("set_setting", { name: setting.name, value: String(value) });
+  if (setting.words.length) {
+    const select = document.createElement("select");
+    for (const word of setting.words) select.add(new Option(word, word, false, word === setting.value));
+    select.onchange = () => change(select.value);
+    return select;
   }
-  if (!table.rows.length) row(table, ["none may be changed while running"]);
-  $("settings").replaceWith(table);
+  const input = document.createElement("input");
+  if (typeof setting.value === "boolean") {
+    [input.type, input.checked] = ["checkbox", setting.value];
+    input.setAttribute("role", "switch");
+    input.onchange = () => change(input.checked);
+    return input;
+  }
+  [input.type, input.value] = [typeof setting.value === "number" ? "number" : "text", setting.value];
+  if (setting.least !== null) [input.min, input.max, input.step] = [setting.least, setting.most, "any"];
+  input.onchange = () => input.reportValidity() && change(input.value);
+  return input;
+}
+
+function showSettings(settings) {
+  const all = document.createElement("div"), groups = {};
+  all.id = "settings";
+  for (const setting of settings) {
+    if (!groups[setting.group]) {
+      const group = groups[setting.group] = document.createElement("fieldset"), legend = document.createElement("legend");
+      legend.textContent = setting.group;
+      group.append(legend);
+      all.append(group);
+    }
+    const label = document.createElement("label"), name = document.createElement("span"), help = document.createElement("span");
+    const value = document.createElement("span");
+    label.className = "setting"; help.className = "help";
+    name.textContent = setting.label; help.textContent = setting.help;
+    value.append(fieldOf(setting), setting.unit ? ` ${setting.unit}` : "");
+    label.append(name, value, help);
+    groups[setting.group].append(label);
+  }
+  if (!settings.length) all.textContent = "none may be changed while running";
+  $("settings").replaceWith(all);
 }
 
 function login() {
@@ -219,7 +323,7 @@ async function start() {
   live.onmessage = (event) => {
     last = JSON.parse(event.data); receivedAt = Date.now();
     refreshMap(last.map_version); refreshPlan(last.plan);
-    showState(last); showHealth(last); showEvents(last); drawPlan(last);
+    showState(last); showHealth(last); showHistory(last); showEvents(last); drawPlan(last);
   };
   refresh();
 }
@@ -227,6 +331,7 @@ async function start() {
 for (const made of document.querySelectorAll("[data-command]")) {
   made.onclick = () => (!made.dataset.ask || confirm(made.dataset.ask)) && command(made.dataset.command);
 }
+prepareView();
 setInterval(nextImage, 300);
 setInterval(refresh, 10000);
 setInterval(() => { if (last) showState(last); if (!live && $("login").hidden) start().catch(() => {}); }, 2000);

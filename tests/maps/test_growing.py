@@ -1,0 +1,76 @@
+"""A saved map that a session is joined with as it goes on, against the same joined at its end."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stereo_sfm.config import Config, LoopConfig, MapperConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop import vocabulary as voc
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.maps.growing import GrowingMap
+from stereo_sfm.maps.merge import subset
+from stereo_sfm.maps.saved_map import SavedMap
+from stereo_sfm.maps.update import update
+from stereo_sfm.types import LoopResult
+from tests.loop.store_sequence import StoreSequence, make_sequence
+from tests.maps.maps import map_of_sequence
+
+
+def first(saved: SavedMap, count: int) -> SavedMap:
+    """The map as it was when it had so many keyframes."""
+    s: MapSnapshot = saved.snapshot
+    keyframes = np.arange(len(s.kf_ids)) < count
+    obs = keyframes[s.obs_kf]
+    points = np.bincount(s.obs_pt[obs], minlength=len(s.pt_ids)) > 0
+    return dataclasses.replace(saved, snapshot=subset(s, keyframes, points, obs), sessions=saved.sessions[keyframes])
+
+
+def two_drives() -> tuple[StoreSequence, StoreSequence, voc.Vocabulary]:
+    """Through one aisle twice, each in its own frame."""
+    whole = make_sequence([0, 0], seed=5, max_points=150)
+    half = int(np.flatnonzero(np.diff((whole.world_T_kf[:, 2, 2] > 0.5).astype(int)) == 1)[0]) + 1
+    parts = [
+        dataclasses.replace(whole, keyframes=whole.keyframes[part], world_T_kf=whole.world_T_kf[part])
+        for part in (slice(0, half), slice(half, None))
+    ]
+    return parts[0], parts[1], voc.train([k.descriptors for k in parts[0].keyframes], depth=3)
+
+
+def test_a_session_is_joined_as_it_goes_on() -> None:
+    before, after, vocabulary = two_drives()
+    saved, walk = map_of_sequence(before), map_of_sequence(after)
+    done = update(saved, walk, vocabulary, LoopConfig(), MapperConfig())
+    begins, points = (int(ids.max()) + 1 for ids in (saved.snapshot.kf_ids, saved.snapshot.pt_ids))
+    loop = next(one for one in done.loops if one.candidate_kf_id < begins <= one.kf_id)
+    place: LoopResult = dataclasses.replace(
+        loop, kf_id=loop.kf_id - begins, matches=loop.matches - np.array([0, points])
+    )
+    growing = GrowingMap(saved, vocabulary, Config())
+    with pytest.raises(StereoSfmError, match="not found in the saved map yet"):
+        growing.take(walk, None)
+    begin = int(np.searchsorted(walk.snapshot.kf_ids, place.kf_id)) + 1
+    for count in (begin, (begin + len(walk)) // 2, len(walk), len(walk)):
+        growing.take(first(walk, count), place)
+        assert len(growing.saved()) == len(saved) + count  # at once, without a search
+    before_search = growing.saved().snapshot
+    while growing.work():
+        pass
+    s = growing.saved()
+    assert s.session_ids == done.saved.session_ids == [0, 1] and len(s) == len(done.saved)
+    shared = len(before_search.pt_ids) - len(s.snapshot.pt_ids)
+    assert shared > 0.7 * done.fused  # what both drives saw is one
+    poses = np.concatenate([before.world_T_kf, after.world_T_kf])
+    true = se3.inverse(poses[0]) @ poses
+    errors = [
+        np.quantile(se3.extent(se3.inverse(true) @ one.map_T_kf), 0.95, axis=1)
+        for one in (before_search, s.snapshot, done.saved.snapshot)
+    ]
+    assert (errors[0] < [0.03, np.radians(0.3)]).all() and (errors[1] < np.maximum(1.2 * errors[2], 0.004)).all()
+    gone = first(walk, len(walk) - 3)  # the session culled its last keyframes
+    growing.take(gone, place)
+    assert len(growing.saved()) == len(saved) + len(gone)
