@@ -2,9 +2,9 @@
 
 Rows need data that is not part of the project, and are left out without it:
 
-* `--middlebury DIR`: motorcycle_left.png, motorcycle_right.png, motorcycle_disp.npz (scikit-image 0.17.2, skimage/data);
-* `--aloe DIR`: aloeL.jpg, aloeR.jpg, aloeGT.png (Debian's opencv-doc). Its ground truth is in whole pixels, which rewards
-  disparities drawn to whole pixels: its median says little about sub-pixel errors;
+* `--middlebury DIR`: motorcycle_left.png, motorcycle_right.png, motorcycle_disp.npz (scikit-image 0.17.2);
+* `--aloe DIR`: aloeL.jpg, aloeR.jpg, aloeGT.png (Debian's opencv-doc). Its ground truth is in whole pixels, which
+  rewards disparities drawn to whole pixels: its median says little about sub-pixel errors;
 * STEREO_SFM_DATA with store_pairs: rendered fisheye pairs with exact ranges.
 
     python benchmarks/dense.py [--middlebury DIR] [--aloe DIR]

@@ -39,8 +39,9 @@ def disparities(left: U8, right: U8, count: int, both: bool = True) -> tuple[F32
     start, back = match_both_ways(left, right, count)
     found, predicted = refine(left, right, start)
     if both:
-        mirrored = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left, back)]
-        other = np.ascontiguousarray(refine(mirrored[0], mirrored[1], mirrored[2])[0][:, ::-1])
+        swapped = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
+        other = refine(swapped[0], swapped[1], np.ascontiguousarray(back[:, ::-1]))[0]
+        other = np.ascontiguousarray(other[:, ::-1])
         found = agreeing(found, other, AGREE_PX)
     predicted = np.where(np.isfinite(found), predicted, np.nan).astype(np.float32)
     return found, learned_sigmas(found, predicted)

@@ -42,8 +42,7 @@ def _match(left: U8, right: U8, disparities: int) -> F32:
     )
     padded = [cv2.copyMakeBorder(i, 0, 0, disparities, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
     found = np.asarray(matcher.compute(padded[0], padded[1]))[:, disparities:].astype(np.float32) / 16
-    found[found <= 0] = np.nan
-    return found
+    return np.where(found > 0, found, np.float32(np.nan))
 
 
 @njit

@@ -100,7 +100,7 @@ def _refine(left, right, disparity, near, like):
                     shift[count] = u + dx - tilt
                     count += 1
             found, done = float(start), False
-            gain = squares = spread = 0.0
+            gain = squares = spread = total = 0.0
             for _ in range(ITERATIONS):
                 total = mean = mean_other = mean_slope = 0.0
                 for k in range(count):
