@@ -1,4 +1,4 @@
-"""From keyframes to a surface: depth images, cubes and their surfaces as files, each made again only if its input moved.
+"""From keyframes to a surface: depth images and cubes as files, each made again only if its input moved.
 
 Every file carries the checksum of what it was made of, and is renamed into place when it is complete: a run that was
 killed goes on where it was, and after a loop or `map update` only the cubes of keyframes that moved are fused again.
@@ -30,7 +30,8 @@ from stereo_sfm.geometry.cameras import MODELS
 from stereo_sfm.maps.floor import HIGH, LOW, find_floor
 from stereo_sfm.types import F64, Bool
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 VERSION = "1"  # of the files: grows when the same input gives other bits
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
 Report = Callable[[str, int, int], None]  # what, done, of
@@ -210,7 +211,7 @@ def _cube(task: Any) -> CubeResult:
     index, kept, folder, voxel = task
     path = folder / _cube_name(index)
     key = hashlib.sha256("".join([VERSION, f"{voxel!r}", *(k.place_key() for k in kept)]).encode()).hexdigest()
-    data = _read(path, key)
+    data: dict[str, Any] | None = _read(path, key)
     if data is None:
         cube = fuse(index, [Seen(_cached_depth(k.path, k.key), k.floor_T_cam, k.session) for k in kept], voxel)
         surface = extract(cube)
@@ -218,13 +219,14 @@ def _cube(task: Any) -> CubeResult:
         height = (index[2] * SIDE + np.arange(SIDE)) * voxel
         band = ((height > LOW) & (height < HIGH))[None, None, :]
         near = np.abs(cube.distance[own]) < voxel
-        data = {
+        columns: dict[str, Any] = {
             "cells": surface.cells, "vertices": surface.vertices, "grey": surface.grey, "quads": surface.quads,
             "occupied": (near & (cube.views[own] >= 2) & band).any(axis=2),
             "free": ((cube.distance[own] > voxel) & (cube.views[own] >= 2) & band).any(axis=2),
             "distance": cube.distance[own].astype(np.float16), "weight": cube.weight[own],
         }  # fmt: skip
-        _write(path, key, data)
+        _write(path, key, columns)
+        data = columns
     surface = Surface(data["cells"], data["vertices"], data["grey"], data["quads"])
     return CubeResult(index, surface, data["occupied"], data["free"])
 

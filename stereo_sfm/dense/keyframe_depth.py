@@ -17,7 +17,7 @@ from stereo_sfm.types import F32, F64, U8
 MOTION_M = (
     0.1,
     0.4,
-)  # between keyframes that are matched: less is no longer than a camera's own baseline, more looks new
+)  # between keyframes that are matched: less is a pair's own baseline, with more, views differ
 BEST_M = 0.3
 VIEW_PX = 640  # longest side of a view: finer ones cost more than a voxel of 2 cm shows
 AGREE_SIGMAS = 3.0
@@ -81,7 +81,8 @@ def seen_in(view: DepthImage, other: DepthImage) -> tuple[F32, F32]:
     inside = other.camera.inside(uv, -0.49)  # the nearest pixel is in the image
     at = np.rint(np.where(inside[..., None], uv, 0)).astype(np.int64)
     pick = at[..., 1], at[..., 0]
-    return tuple(np.where(inside, values[pick], np.float32(np.nan)) for values in (other.ranges, other.sigmas))
+    nan = np.float32(np.nan)
+    return np.where(inside, other.ranges[pick], nan), np.where(inside, other.sigmas[pick], nan)
 
 
 def check_rig(rig: Rig) -> None:

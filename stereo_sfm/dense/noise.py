@@ -2,8 +2,8 @@
 
 Grey-level noise explains a part of a disparity's error; windows that are not quite planes, lenses and resampling add
 more. What they add shows on surfaces: of three windows in a row that share no pixel, the middle one should have the
-mean of the others. Second differences d(-1) - 2 d(0) + d(+1) have six times the variance of one disparity where errors are
-independent. Their quantile that holds 68 %, by the noise that grey levels predict, is the standard deviation: gross
+mean of the others. Second differences d(-1) - 2 d(0) + d(+1) have six times the variance of one disparity where errors
+are independent. Their quantile that holds 68 %, by the noise that grey levels predict, is the standard deviation: gross
 errors and bent surfaces are in it, errors that three windows share are not.
 """
 

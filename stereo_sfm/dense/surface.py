@@ -1,4 +1,4 @@
-"""The surface of a distance field as quadrilaterals: one vertex in each cell that it crosses (Gibson, surface nets, 1998).
+"""The surface of a distance field as quadrilaterals: one vertex in each cell that it crosses (surface nets, Gibson 1998).
 
 The vertex is the mean of the crossings of the cell's edges. Cells have numbers of the whole volume, and both cubes at a
 border compute the same vertex of a cell, so meshes of cubes join by the numbers.
@@ -76,7 +76,7 @@ def _quads(d: F32, crossed: Bool, cube: Cube) -> I64:
     for axis in range(3):
         u, v = (axis + 1) % 3, (axis + 2) % 3
         here = d[own, own, own] < 0
-        part = [own, own, own]
+        part: list[slice] = [own, own, own]
         part[axis] = np.s_[APRON + 1 : APRON + SIDE + 1]
         there = d[tuple(part)] < 0
         base = np.argwhere(here != there) + APRON

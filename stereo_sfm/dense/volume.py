@@ -85,8 +85,8 @@ def fuse(index: tuple[int, int, int], images: Sequence[Seen], voxel: float) -> C
         for whole, part in zip(total, own, strict=True):
             whole[counts] += part[counts]
     distance, weight, views, grey = total
-    mean = distance / np.maximum(weight, 1e-20)
-    return Cube(index, mean, weight, views, grey / np.maximum(weight, 1e-20))
+    weighed = np.maximum(weight, np.float32(1e-20))
+    return Cube(index, (distance / weighed).astype(np.float32), weight, views, (grey / weighed).astype(np.float32))
 
 
 def _add(sums: list[F32], seen: Seen, corner: F64, voxel: float) -> None:
