@@ -1,4 +1,4 @@
-"""The surface of a distance field as quadrilaterals: one vertex in each cell that it crosses (surface nets, Gibson 1998).
+"""The surface of a distance field as quadrilaterals: one vertex in each cell that it crosses (Gibson, surface nets).
 
 The vertex is the mean of the crossings of the cell's edges. Cells have numbers of the whole volume, and both cubes at a
 border compute the same vertex of a cell, so meshes of cubes join by the numbers.
