@@ -7,7 +7,7 @@ Rows need data that is not part of the project, and are left out without it:
   rewards disparities drawn to whole pixels: its median says little about sub-pixel errors;
 * STEREO_SFM_DATA with store_pairs: rendered fisheye pairs with exact ranges.
 
-    python benchmarks/dense.py [--middlebury DIR] [--aloe DIR]
+    python benchmarks/dense.py [--middlebury DIR] [--aloe DIR] [--pairs N]
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from stereo_sfm.dense.views import stereo_view
 from stereo_sfm.geometry.cameras import KannalaBrandt
 from stereo_sfm.types import F32, F64, U8, Bool
 
+PAIRS = 24  # in store_pairs
 NEAR_M = 2.5  # shelves as a robot sees them
 
 
@@ -89,7 +90,7 @@ def aloe(folder: Path) -> None:
     pair("aloe", left, right, truth.astype(float), truth > 0, 224)
 
 
-def store_pairs(folder: Path) -> None:
+def store_pairs(folder: Path, count: int) -> None:
     """Ranges of rendered fisheye pairs within `NEAR_M`, of the single pair."""
     rig = json.loads((folder / "rig.json").read_text())
     cameras = [
@@ -100,7 +101,7 @@ def store_pairs(folder: Path) -> None:
     uv = cameras[0].project(view.camera.bearing_grid() @ view.cam_R_view.T)
     at = np.nan_to_num(uv, nan=-9).astype(np.float32)
     errors, base_errors, held, coverage = [], [], [], []
-    for path in sorted((folder / "left").iterdir()):
+    for path in sorted((folder / "left").iterdir())[:: max(1, PAIRS // count)]:
         left, right = (cv2.imread(str(folder / side / path.name), 0) for side in ("left", "right"))
         stored = cv2.imread(str(folder / "range" / f"{path.stem}.png"), cv2.IMREAD_UNCHANGED)
         assert left is not None and right is not None and stored is not None
@@ -131,6 +132,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--middlebury", type=Path)
     parser.add_argument("--aloe", type=Path)
+    parser.add_argument("--pairs", type=int, default=PAIRS, help="of store_pairs, evenly spread (default: all 24)")
     options = parser.parse_args()
     if options.middlebury:
         middlebury(options.middlebury)
@@ -138,7 +140,7 @@ def main() -> None:
         aloe(options.aloe)
     data = Path(os.environ.get("STEREO_SFM_DATA", "../shared/data")) / "store_pairs"
     if data.is_dir():
-        store_pairs(data)
+        store_pairs(data, options.pairs)
 
 
 if __name__ == "__main__":

@@ -42,18 +42,21 @@ def earlier(keyframes: Sequence[KeyframeImages], now: KeyframeImages) -> Keyfram
 
 
 def keyframe_depth(now: KeyframeImages, before: KeyframeImages | None) -> DepthImage | None:
-    """Depth of a keyframe's left camera; None where there is one camera and no motion."""
+    """Depth of a keyframe's left camera; None where there is one camera and no motion.
+
+    The right images' disparities are not refined: it would take twice the time, and other keyframes tell gross errors.
+    """
     rig, pair = now.rig, None
     scale = min(1.0, VIEW_PX / max(rig.left.size))
     if rig.second_camera is not None and now.right is not None:
-        pair = pair_depth(stereo_view(rig, scale), now.left, now.right)
+        pair = pair_depth(stereo_view(rig, scale), now.left, now.right, both=False)
     if before is None:
         return pair
     now_T_before = se3.inverse(now.map_T_cam) @ before.map_T_cam
     view = motion_view(rig.left, before.rig.left, now_T_before, scale * rig.left.fx)
     if view is None:
         return pair
-    moved = pair_depth(view, now.left, before.left)
+    moved = pair_depth(view, now.left, before.left, both=False)
     return moved if pair is None else joined(pair, moved)
 
 

@@ -126,8 +126,8 @@ def motion_view(first: Camera, second: Camera, first_T_second: F64, focal: float
         _resampling(first, camera, view_R_first),
         _resampling(second, camera, view_R_first @ first_T_second[:3, :3]),
     ]
-    rows = np.flatnonzero((parts[0].mask & parts[1].mask).any(axis=1))
-    columns = np.flatnonzero((parts[0].mask | parts[1].mask).any(axis=0))
+    rows = np.flatnonzero((parts[0].mask & parts[1].mask).any(axis=1)).tolist()
+    columns = np.flatnonzero((parts[0].mask | parts[1].mask).any(axis=0)).tolist()
     if len(rows) < 16 or len(columns) < 16:
         return None
     cut = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
