@@ -35,6 +35,7 @@ COMMANDS: dict[str, str] = {
     "convert-calib": "convert a calibration between the formats of Kalibr, ROS, OpenCV, COLMAP, EuRoC and others",
     "map": "describe, merge, prune and export saved maps",
     "export": "export a run or a map to the formats of other programs",
+    "dense": "make a mesh, a cloud and a costmap from the images of a run or a map",
     "vocabulary": "train or describe the vocabulary of place recognition",
     "ablation": "compare the features, estimators and modules of the papers",
     "eval": "compare a trajectory with ground truth",

@@ -38,6 +38,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.recording",
     "stereo_sfm.export",
     "stereo_sfm.viz",
+    "stereo_sfm.dense",
     "stereo_sfm.pipeline",
     "stereo_sfm.eval",
     "stereo_sfm.system",

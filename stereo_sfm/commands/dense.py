@@ -1,0 +1,84 @@
+"""`stereo-sfm dense`: a mesh, a cloud and a costmap from a run's or a map's keyframes."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereo_sfm.commands._options import typed
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("source", type=Path, metavar="RUN|MAP", help="folder of a run, or of a saved map")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write or to go on")
+    parser.add_argument(
+        "--images",
+        action="append",
+        default=[],
+        metavar="SOURCE",
+        help="recording that holds the images (default: the run's log or its source); again for each session of a map",
+    )
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
+    parser.add_argument("--voxel", type=float, default=0.02, metavar="M", help="side of a voxel (default: 0.02)")
+    parser.add_argument(
+        "--jobs", type=int, default=2, metavar="N", help="processes; the result is the same (default: 2)"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
+
+
+@dataclass(frozen=True)
+class DenseOptions:
+    """Options of this command, as the parser names them."""
+
+    source: Path
+    output: Path
+    images: list[str]
+    rig: Path | None
+    voxel: float
+    jobs: int
+    quiet: bool
+
+
+def run(args: argparse.Namespace) -> int:
+    """Reconstruct, write the files, print what they hold."""
+    options = typed(DenseOptions, args)
+    from stereo_sfm.dense.build import build
+    from stereo_sfm.dense.files import write_all
+    from stereo_sfm.dense.inputs import find_input
+    from stereo_sfm.errors import StereoSfmError, writing_to
+    from stereo_sfm.folder_lock import FolderLock
+
+    if not 0.005 <= options.voxel <= 0.2:
+        raise StereoSfmError("--voxel must be between 0.005 and 0.2 metres")
+    if options.jobs < 1:
+        raise StereoSfmError("--jobs must be at least 1")
+    given = find_input(options.source, options.images, options.rig)
+    with writing_to(options.output):
+        options.output.mkdir(parents=True, exist_ok=True)
+        with FolderLock(options.output, "choose another -o, or wait for its end"):
+            results, map_T_floor = build(given, options.output, options.voxel, options.jobs, _Bars(options.quiet))
+            numbers = write_all(results, options.output, options.voxel, map_T_floor)
+    if not options.quiet:
+        print(", ".join(f"{value:.0f} {name}" for name, value in numbers.items()))
+        print(f"written to {options.output}: mesh.ply, mesh.glb, cloud.ply, costmap.png, costmap.yaml, height.png")
+    return 0
+
+
+class _Bars:
+    """One progress bar after the other, with the time left."""
+
+    def __init__(self, quiet: bool) -> None:
+        self._quiet, self._what = quiet, ""
+
+    def __call__(self, what: str, done: int, total: int) -> None:
+        from stereo_sfm.commands._progress import progress
+
+        if what != self._what:
+            self._what = what
+            self._bar = progress(what, total, self._quiet, what)
+            self._bar.__enter__()
+        self._bar.step("")
+        if done == total:
+            self._bar.__exit__(None, None, None)

@@ -1,0 +1,262 @@
+"""From keyframes to a surface: depth images and cubes as files, each made again only if its input moved.
+
+Every file carries the checksum of what it was made of, and is renamed into place when it is complete: a run that was
+killed goes on where it was, and after a loop or `map update` only the cubes of keyframes that moved are fused again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from stereo_sfm.calib.formats.native import rig_to_text
+from stereo_sfm.dense.depth import DepthImage
+from stereo_sfm.dense.inputs import DenseInput, keyframes
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth
+from stereo_sfm.dense.surface import Surface, extract
+from stereo_sfm.dense.volume import SIDE, Seen, contributes, cubes_of, fuse, touched
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import MODELS
+from stereo_sfm.maps.floor import HIGH, LOW, find_floor
+from stereo_sfm.types import F64, Bool
+
+T = TypeVar("T")
+R = TypeVar("R")
+VERSION = "1"  # of the files: grows when the same input gives other bits
+CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
+Report = Callable[[str, int, int], None]  # what, done, of
+
+
+@dataclass(frozen=True, eq=False)
+class KeptDepth:
+    """A depth image on disk and what is known of it without reading it."""
+
+    path: Path
+    key: str  # checksum of what it was made of
+    floor_T_cam: F64
+    session: int
+    reach: float  # metres
+    cubes: tuple[tuple[int, int, int], ...]
+
+    def place_key(self) -> str:
+        """Changes with the image or its pose."""
+        return self.key + hashlib.sha256(self.floor_T_cam.tobytes()).hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class CubeResult:
+    """What is kept of a cube besides its voxels."""
+
+    index: tuple[int, int, int]
+    surface: Surface
+    occupied: Bool  # (64, 64) columns along x, y with a surface between `LOW` and `HIGH`
+    free: Bool  # (64, 64) columns seen free at some height between them
+
+
+def build(
+    given: DenseInput, folder: Path, voxel: float, jobs: int, report: Report = lambda *_: None
+) -> tuple[list[CubeResult], F64]:
+    """All cubes, ordered by their index, and map_T_floor (4, 4).
+
+    Args:
+        given: the map and its images. folder: for the files; may hold those of an earlier run.
+        voxel: metres. jobs: processes; the bits do not depend on them. report: called after each step.
+    """
+    map_T_floor = find_floor(given.saved.snapshot)
+    for name in ("depth", "cubes"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    with _Workers(jobs) as workers:
+        kept = _depths(given, folder / "depth", voxel, map_T_floor, workers, report)
+        if not kept:
+            raise StereoSfmError("no keyframe has depth: one camera needs keyframes 10 to 40 cm apart")
+        cubes = cubes_of([set(k.cubes) for k in kept])
+        tasks = [
+            (c, [k for k in kept if contributes(k.floor_T_cam[:3, 3], k.reach, c, voxel)], folder / "cubes", voxel)
+            for c in cubes
+        ]
+        results: list[CubeResult] = []
+        for number, result in enumerate(workers.map(_cube, tasks), 1):
+            results.append(result)
+            report("cubes", number, len(tasks))
+    _remove_others(folder / "cubes", {_cube_name(c) for c in cubes})
+    return results, map_T_floor
+
+
+class _Workers:
+    """Results in the order of the tasks, from processes or from this one; bounded number of tasks in flight."""
+
+    def __init__(self, jobs: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_one_thread) if jobs > 1 else None
+        self._ahead = 2 * jobs
+
+    def __enter__(self) -> _Workers:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=kind is not None)
+
+    def map(self, function: Callable[[T], R], tasks: Iterable[T]) -> Iterator[R]:
+        if self._pool is None:
+            yield from map(function, tasks)
+            return
+        waiting: deque[Future[R]] = deque()
+        for task in tasks:
+            waiting.append(self._pool.submit(function, task))
+            if len(waiting) >= self._ahead:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+def _one_thread() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+# -- depth images ---------------------------------------------------------------------------------------------------
+
+
+def _depths(
+    given: DenseInput, folder: Path, voxel: float, map_T_floor: F64, workers: _Workers, report: Report
+) -> list[KeptDepth]:
+    floor_T_map, sessions, count = se3.inverse(map_T_floor), given.saved.sessions, len(given.saved)
+
+    def tasks() -> Iterator[Any]:
+        recent: deque[KeyframeImages] = deque(maxlen=16)  # more keyframes are too far away
+        for now in keyframes(given):
+            if recent and sessions[recent[-1].number] != sessions[now.number]:
+                recent.clear()
+            place = floor_T_map @ now.map_T_cam
+            yield now, earlier(recent, now), folder, voxel, place, int(sessions[now.number])
+            recent.append(now)
+
+    kept: list[KeptDepth] = []
+    for number, result in enumerate(workers.map(_depth, tasks()), 1):
+        kept += [result] if result is not None else []
+        report("depth images", number, count)
+    return kept
+
+
+def _depth(task: Any) -> KeptDepth | None:
+    now, before, folder, voxel, floor_T_cam, session = task
+    path, key = folder / f"{now.number:06d}.npz", _depth_key(now, before)
+    found = _read_depth(path, key)
+    if found is None:
+        found = keyframe_depth(now, before)
+        if found is None:
+            return None
+        _write(path, key, _depth_columns(found))
+    seen = Seen(found, floor_T_cam, session)
+    return KeptDepth(path, key, floor_T_cam, session, seen.reach, tuple(sorted(touched(seen, voxel))))
+
+
+def _depth_key(now: KeyframeImages, before: KeyframeImages | None) -> str:
+    """Of the images, the cameras and the motion between, to a hundredth of a millimetre: less moves no disparity."""
+    digest = hashlib.sha256(VERSION.encode())
+    for part in (now.left, now.right, None if before is None else before.left):
+        digest.update(b"-" if part is None else part.tobytes())
+    digest.update(rig_to_text(now.rig).encode())
+    if before is not None:
+        motion = se3.inverse(now.map_T_cam) @ before.map_T_cam
+        digest.update(np.rint(motion * 1e5).astype(np.int64).tobytes())
+    return digest.hexdigest()
+
+
+def _depth_columns(depth: DepthImage) -> dict[str, Any]:
+    c = depth.camera
+    return {
+        "ranges": depth.ranges, "sigmas": depth.sigmas, "grey": depth.grey, "cam_R_view": depth.cam_R_view,
+        "model": np.array(c.model), "size": np.array(c.size), "camera": np.array([c.fx, c.fy, c.cx, c.cy]),
+    }  # fmt: skip
+
+
+def _read_depth(path: Path, key: str | None) -> DepthImage | None:
+    data = _read(path, key)
+    if data is None:
+        return None
+    width, height = data["size"].tolist()
+    camera = MODELS[str(data["model"])](width, height, *data["camera"].tolist())
+    return DepthImage(camera, data["cam_R_view"], data["ranges"], data["sigmas"], data["grey"])
+
+
+@lru_cache(CACHED)
+def _cached_depth(path: Path, key: str) -> DepthImage:
+    found = _read_depth(path, key)
+    if found is None:
+        raise StereoSfmError(f"{path} was removed or changed while it was used: run again")
+    return found
+
+
+# -- cubes ----------------------------------------------------------------------------------------------------------
+
+
+def _cube_name(index: tuple[int, int, int]) -> str:
+    return "_".join(map(str, index)) + ".npz"
+
+
+def _cube(task: Any) -> CubeResult:
+    index, kept, folder, voxel = task
+    path = folder / _cube_name(index)
+    key = hashlib.sha256("".join([VERSION, f"{voxel!r}", *(k.place_key() for k in kept)]).encode()).hexdigest()
+    data: dict[str, Any] | None = _read(path, key)
+    if data is None:
+        cube = fuse(index, [Seen(_cached_depth(k.path, k.key), k.floor_T_cam, k.session) for k in kept], voxel)
+        surface = extract(cube)
+        own = np.s_[1 : SIDE + 1, 1 : SIDE + 1, 1 : SIDE + 1]
+        height = (index[2] * SIDE + np.arange(SIDE)) * voxel
+        band = ((height > LOW) & (height < HIGH))[None, None, :]
+        near = np.abs(cube.distance[own]) < voxel
+        columns: dict[str, Any] = {
+            "cells": surface.cells, "vertices": surface.vertices, "grey": surface.grey, "quads": surface.quads,
+            "occupied": (near & (cube.views[own] >= 2) & band).any(axis=2),
+            "free": ((cube.distance[own] > voxel) & (cube.views[own] >= 2) & band).any(axis=2),
+            "distance": cube.distance[own].astype(np.float16), "weight": cube.weight[own],
+        }  # fmt: skip
+        _write(path, key, columns)
+        data = columns
+    surface = Surface(data["cells"], data["vertices"], data["grey"], data["quads"])
+    return CubeResult(index, surface, data["occupied"], data["free"])
+
+
+def _remove_others(folder: Path, names: set[str]) -> None:
+    """Files of cubes in which nothing is any more."""
+    for path in sorted(folder.glob("*.npz")):
+        if path.name not in names:
+            path.unlink()
+
+
+# -- files ----------------------------------------------------------------------------------------------------------
+
+
+def _write(path: Path, key: str, columns: dict[str, Any]) -> None:
+    """Complete or not at all."""
+    part = path.with_suffix(".part")
+    try:
+        with part.open("wb") as file:
+            np.savez_compressed(file, key=np.array(key), **columns)
+        part.replace(path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def _read(path: Path, key: str | None) -> dict[str, Any] | None:
+    """The columns of a file; None where there is none, it is damaged, or it was made of something else."""
+    try:
+        with np.load(path) as data:
+            return {name: data[name] for name in data.files} if str(data["key"]) == key else None
+    except (OSError, ValueError, KeyError, EOFError):
+        return None

@@ -1,0 +1,55 @@
+"""Depth of one view: matching, refinement, standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.dense.matching import AGREE_PX, agreeing, match_both_ways
+from stereo_sfm.dense.noise import learned_sigmas
+from stereo_sfm.dense.refinement import refine
+from stereo_sfm.dense.views import PairView
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.types import F32, F64, U8, ReadOnly
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage(ReadOnly):
+    """Ranges along the rays of a virtual camera at the place of the left camera."""
+
+    camera: Camera
+    cam_R_view: F64  # (3, 3) into the left camera
+    ranges: F32  # (H, W) metres, NaN where unknown
+    sigmas: F32  # (H, W) metres, standard deviations
+    grey: U8  # (H, W)
+
+    def points(self) -> F32:
+        """(H, W, 3) metres in the left camera."""
+        return ((self.camera.bearing_grid() @ self.cam_R_view.T) * self.ranges[..., None]).astype(np.float32)
+
+
+def disparities(left: U8, right: U8, count: int, both: bool = True) -> tuple[F32, F32]:
+    """(H, W) px disparities of a rectified pair and their standard deviations, NaN where unknown.
+
+    Args:
+        left, right: (H, W). count: largest disparity plus one, a multiple of 16.
+        both: refine the right image's disparities as well, and keep what agrees: fewer gross errors, twice the time.
+    """
+    start, back = match_both_ways(left, right, count)
+    found, predicted = refine(left, right, start)
+    if both:
+        swapped = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
+        other = refine(swapped[0], swapped[1], np.ascontiguousarray(back[:, ::-1]))[0]
+        other = np.ascontiguousarray(other[:, ::-1])
+        found = agreeing(found, other, AGREE_PX)
+    predicted = np.where(np.isfinite(found), predicted, np.nan).astype(np.float32)
+    return found, learned_sigmas(found, predicted)
+
+
+def pair_depth(view: PairView, left: U8, right: U8, both: bool = True) -> DepthImage:
+    """Depth of a pair of images of the view's cameras."""
+    a, b = view.images(left, right)
+    disparity, sigma = disparities(a, b, view.disparities, both)
+    disparity[~view.first.mask] = np.nan
+    return DepthImage(view.camera, view.cam_R_view, view.ranges(disparity), view.range_sigmas(disparity, sigma), a)

@@ -1,0 +1,121 @@
+"""What a reconstruction is written as: mesh and cloud (PLY, GLB), costmap of map_server, picture from above."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.dense.build import CubeResult
+from stereo_sfm.dense.surface import joined
+from stereo_sfm.dense.volume import SIDE
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, write_floor_plan
+from stereo_sfm.export.ply import write_ply
+from stereo_sfm.types import F32, F64, I64, U8
+
+
+def write_all(results: list[CubeResult], folder: Path, voxel: float, map_T_floor: F64) -> dict[str, float]:
+    """Write mesh.ply, mesh.glb, cloud.ply, costmap.png and costmap.yaml, height.png; returns numbers about them.
+
+    All are in the floor's frame of `costmap.yaml` (`map_T_floor`): metres, z up, z = 0 on the floor.
+    """
+    vertices, grey, triangles = joined([r.surface for r in results])
+    points = vertices.astype(np.float64) * voxel
+    colours = np.repeat(grey[:, None], 3, axis=1)
+    write_mesh_ply(folder / "mesh.ply", points, colours, triangles)
+    write_glb(folder / "mesh.glb", points, colours, triangles)
+    write_ply(folder / "cloud.ply", points, colours)
+    plan = costmap(results, voxel, map_T_floor)
+    write_floor_plan(plan, folder / "costmap")
+    write_heights(folder / "height.png", points, voxel)
+    area = 0.0
+    if len(triangles):
+        a, b, c = (points[triangles[:, i]] for i in range(3))
+        area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return {"vertices": len(points), "triangles": len(triangles), "square metres": area, "cubes": len(results)}
+
+
+def write_mesh_ply(path: Path, points: F64, colours: U8, triangles: I64) -> None:
+    """Binary little-endian PLY with colours at the vertices."""
+    vertex = np.empty(len(points), [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
+    for i, name in enumerate("xyz"):
+        vertex[name] = points[:, i]
+    for i, name in enumerate(("red", "green", "blue")):
+        vertex[name] = colours[:, i]
+    face = np.empty(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
+    face["n"], face["i"] = 3, triangles
+    header = ["ply", "format binary_little_endian 1.0", "comment metres", f"element vertex {len(points)}"]
+    header += [f"property float {n}" for n in "xyz"] + [f"property uchar {n}" for n in ("red", "green", "blue")]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(header).encode() + vertex.tobytes() + face.tobytes())
+
+
+def write_glb(path: Path, points: F64, colours: U8, triangles: I64) -> None:
+    """Binary glTF 2.0 with colours at the vertices; y up, as it demands."""
+    xyz = np.stack([points[:, 0], points[:, 2], -points[:, 1]], axis=1).astype("<f4")
+    rgba = np.concatenate([colours, np.full((len(colours), 1), 255, np.uint8)], axis=1)
+    parts = [xyz.tobytes(), rgba.tobytes(), triangles.astype("<u4").tobytes()]
+    at = np.cumsum([0, *map(len, parts)]).tolist()
+    low, high = (xyz.min(0), xyz.max(0)) if len(xyz) else (np.zeros(3), np.zeros(3))
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "stereo-sfm"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "mode": 4}]}],
+        "buffers": [{"byteLength": at[-1]}],
+        "bufferViews": [{"buffer": 0, "byteOffset": at[i], "byteLength": len(parts[i])} for i in range(3)],
+        "accessors": [
+            {
+                "bufferView": 0, "componentType": 5126, "count": len(xyz), "type": "VEC3",
+                "min": low.tolist(), "max": high.tolist(),
+            },
+            {"bufferView": 1, "componentType": 5121, "normalized": True, "count": len(xyz), "type": "VEC4"},
+            {"bufferView": 2, "componentType": 5125, "count": 3 * len(triangles), "type": "SCALAR"},
+        ],
+    }  # fmt: skip
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    data = b"".join(parts)
+    head = struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(data))
+    path.write_bytes(
+        head + struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    )
+
+
+def costmap(results: list[CubeResult], voxel: float, map_T_floor: F64) -> FloorPlan:
+    """Where a robot meets something between the floor and its height, one pixel a voxel."""
+    columns = np.array([r.index[:2] for r in results])
+    low, high = columns.min(axis=0), columns.max(axis=0) + 1
+    shape = ((high - low) * SIDE).tolist()
+    occupied, free = np.zeros(shape, bool), np.zeros(shape, bool)
+    for r in results:
+        x, y = ((np.array(r.index[:2]) - low) * SIDE).tolist()
+        occupied[x : x + SIDE, y : y + SIDE] |= r.occupied
+        free[x : x + SIDE, y : y + SIDE] |= r.free
+    image = np.full(shape, UNKNOWN, np.uint8)
+    image[free] = FREE
+    image[occupied] = OCCUPIED
+    origin = (low * SIDE * voxel).tolist()
+    return FloorPlan(np.ascontiguousarray(image.T[::-1]), voxel, (origin[0], origin[1]), map_T_floor)
+
+
+def write_heights(path: Path, points: F64, voxel: float) -> None:
+    """The surface from above, coloured by height."""
+    import cv2
+
+    if not len(points):
+        return
+    low = points[:, :2].min(axis=0)
+    at = np.floor((points[:, :2] - low) / voxel).astype(np.int64)
+    size = (at.max(axis=0) + 1).tolist()
+    top: F32 = np.full(size, -np.inf, np.float32)
+    np.maximum.at(top, (at[:, 0], at[:, 1]), points[:, 2].astype(np.float32))
+    least, most = np.quantile(points[:, 2], [0.02, 0.98])
+    share = np.clip((np.where(np.isfinite(top), top, least) - least) / max(most - least, 1e-3), 0, 1)
+    picture = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)
+    picture[~np.isfinite(top)] = 255
+    cv2.imwrite(str(path), np.ascontiguousarray(picture.transpose(1, 0, 2)[::-1]))

@@ -1,0 +1,146 @@
+"""Sub-pixel refinement of disparities: each window is aligned with the other image as a slanted plane.
+
+Gauss-Newton on the disparity of the middle (Lucas and Kanade, IJCAI 1981), with zero-mean differences, for brightness
+may differ between the cameras. The plane's slopes come from the disparities around; a pixel counts by its distance, by
+its likeness to the middle (Yoon and Kweon, PAMI 28, 2006) and by how well its disparity lies on the plane, so that
+windows at depth edges do not mix two surfaces.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.geometry.kernels import inner, njit
+from stereo_sfm.types import F32, U8
+
+RADIUS = 4  # px of a window
+SPREAD = 2.5  # px, standard deviation of the weights by distance
+LIKENESS = 20.0  # grey levels at which the weight by likeness falls to 1/e
+ON_PLANE = 0.5  # px from the plane at which a pixel's weight falls to a quarter
+SAME_SURFACE = 1.5  # px of disparity from the middle's within which a pixel takes part in the plane
+UNKNOWN_WEIGHT = 0.05  # of pixels without disparity: mostly occluded, but they may be all that there is
+ITERATIONS = 6
+FARTHEST = 1.5  # px from the start: beyond, another match was found
+LEAST_GRADIENT = 0.03  # grey levels a pixel, root mean square in a window: below, rounding decides
+MATCH_PX = 1.5  # px, standard deviation of the matcher's disparity: holds windows with hardly any texture
+GREY_NOISE = 1.0  # grey levels, of a camera's pixel after rounding and resampling
+
+
+def refine(left: U8, right: U8, disparity: F32) -> tuple[F32, F32]:
+    """Refined (H, W) px disparities, and the standard deviations (H, W) px that grey-level noise alone would give.
+
+    Args:
+        left, right: (H, W) rectified images.
+        disparity: (H, W) px from matching, NaN where unknown.
+
+    Returns:
+        NaN where a window has no texture along the row or drifts away.
+    """
+    offset = np.arange(-RADIUS, RADIUS + 1)
+    near = np.exp(-(offset[:, None] ** 2 + offset[None, :] ** 2) / (2 * SPREAD**2)).ravel()
+    like = np.exp(-np.arange(256) / LIKENESS)
+    return _refine(left, right, disparity, near, like)
+
+
+@inner
+def _slopes(disparity, u, v):
+    """Slopes of the disparity along columns and rows around a pixel, by least squares over its surface."""
+    n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
+    middle = disparity[v, u]
+    for dy in range(-RADIUS, RADIUS + 1):
+        for dx in range(-RADIUS, RADIUS + 1):
+            q = disparity[v + dy, u + dx] - middle
+            if not abs(q) <= SAME_SURFACE:
+                continue
+            n += 1.0
+            sx += dx
+            sy += dy
+            sxx += dx * dx
+            syy += dy * dy
+            sxy += dx * dy
+            sd += q
+            sxd += dx * q
+            syd += dy * q
+    mx, my, md = sx / n, sy / n, sd / n
+    xx, yy, xy = sxx / n - mx * mx + 0.3, syy / n - my * my + 0.3, sxy / n - mx * my  # 0.3: few pixels give no slope
+    xd, yd = sxd / n - mx * md, syd / n - my * md
+    det = xx * yy - xy * xy
+    return (yy * xd - xy * yd) / det, (xx * yd - xy * xd) / det
+
+
+@njit
+def _refine(left, right, disparity, near, like):
+    h, w = left.shape
+    out, sigma = np.full((h, w), np.nan, np.float32), np.full((h, w), np.nan, np.float32)
+    size = (2 * RADIUS + 1) ** 2
+    weight, grey, rows, shift = np.empty(size), np.empty(size), np.empty(size, np.int64), np.empty(size)
+    other, slope = np.empty(size), np.empty(size)
+    held = (GREY_NOISE / MATCH_PX) ** 2
+    for v in range(RADIUS, h - RADIUS):
+        for u in range(RADIUS, w - RADIUS):
+            start = disparity[v, u]
+            if math.isnan(start):
+                continue
+            a, b = _slopes(disparity, u, v)
+            middle, count = np.int64(left[v, u]), 0
+            for dy in range(-RADIUS, RADIUS + 1):
+                for dx in range(-RADIUS, RADIUS + 1):
+                    tilt = a * dx + b * dy
+                    off = (disparity[v + dy, u + dx] - start - tilt) / ON_PLANE
+                    fits = UNKNOWN_WEIGHT if math.isnan(off) else 1.0 / (1.0 + off * off) ** 2
+                    value = np.int64(left[v + dy, u + dx])  # uint8 would wrap round
+                    k = (dy + RADIUS) * (2 * RADIUS + 1) + dx + RADIUS
+                    weight[count] = near[k] * like[abs(value - middle)] * fits
+                    grey[count] = value
+                    rows[count] = v + dy
+                    shift[count] = u + dx - tilt
+                    count += 1
+            found, done = float(start), False
+            gain = squares = spread = total = 0.0
+            for _ in range(ITERATIONS):
+                total = mean = mean_other = mean_slope = 0.0
+                for k in range(count):
+                    x = shift[k] - found
+                    j = int(math.floor(x))
+                    if j < 1 or j + 2 >= w:
+                        weight[k] = other[k] = slope[k] = 0.0
+                        continue
+                    f = x - j
+                    p0, p1 = float(right[rows[k], j - 1]), float(right[rows[k], j])
+                    p2, p3 = float(right[rows[k], j + 1]), float(right[rows[k], j + 2])
+                    c1, c2, c3 = p2 - p0, 2 * p0 - 5 * p1 + 4 * p2 - p3, 3 * (p1 - p2) + p3 - p0  # Catmull-Rom
+                    other[k] = p1 + 0.5 * f * (c1 + f * (c2 + f * c3))
+                    slope[k] = 0.5 * c1 + f * (c2 + 1.5 * f * c3)
+                    total += weight[k]
+                    mean += weight[k] * grey[k]
+                    mean_other += weight[k] * other[k]
+                    mean_slope += weight[k] * slope[k]
+                if total < 1e-6:
+                    break
+                mean, mean_other, mean_slope = mean / total, mean_other / total, mean_slope / total
+                gain = pull = squares = spread = 0.0
+                for k in range(count):
+                    g, e = slope[k] - mean_slope, grey[k] - mean - other[k] + mean_other
+                    wg = weight[k] * g
+                    gain += wg * g
+                    pull += wg * e
+                    squares += weight[k] * e * e
+                    spread += wg * wg
+                if gain < LEAST_GRADIENT * LEAST_GRADIENT * total:
+                    break
+                step = min(max(-pull / (gain + held * total), -0.5), 0.5)
+                found += step
+                if abs(found - start) > FARTHEST:
+                    break
+                squares /= total
+                done = True
+                if abs(step) < 0.01:
+                    break
+            if done and gain >= LEAST_GRADIENT * LEAST_GRADIENT * total and abs(found - start) <= FARTHEST:
+                out[v, u] = found
+                sigma[v, u] = math.sqrt((squares + GREY_NOISE * GREY_NOISE) * spread) / gain
+    return out, sigma

@@ -1,0 +1,136 @@
+"""`stereo-sfm dense`: files, going on where it was, bad input in one line."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from stereo_sfm.cli import main
+from stereo_sfm.dense import build as module
+from stereo_sfm.dense.files import write_all
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth
+from tests.dense.test_depth import render
+from tests.maps.maps import small_map
+from tests.synthetic import pinhole_rig
+
+VOXEL = 0.04
+WALLS = [(2, 2.0), (0, -1.0), (0, 1.1)]
+FLOOR = np.eye(4)  # z up from a floor 1 m below the camera, which looks along y
+FLOOR[:3, :3] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
+FLOOR[:3, 3] = (0, 1.0, 0)
+
+
+def drive(steps: int = 3, right: bool = True) -> list[KeyframeImages]:
+    """Keyframes that move ahead by 15 cm."""
+    rig, out = pinhole_rig(), []
+    for k in range(steps):
+        pose = np.eye(4)
+        pose[2, 3] = 0.15 * k
+        other = render(rig.right, pose @ rig.left_T_right, WALLS)[0] if rig.right is not None and right else None
+        out.append(KeyframeImages(k, rig, pose, render(rig.left, pose, WALLS)[0], other))
+    return out
+
+
+class _Saved:
+    snapshot, sessions = None, np.zeros(3, np.int64)
+
+    def __len__(self) -> int:
+        return 3
+
+
+class Case:
+    """A drive as `build` takes it, without recordings."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.frames, self.made = drive(), 0
+        self.given: Any = SimpleNamespace(saved=_Saved())
+        monkeypatch.setattr(module, "keyframes", self._keyframes)
+        monkeypatch.setattr(module, "find_floor", lambda _: FLOOR)
+        monkeypatch.setattr(module, "fuse", self._fuse)
+
+    def _keyframes(self, _: object) -> Iterator[KeyframeImages]:
+        yield from self.frames
+
+    def _fuse(self, *args: Any) -> Any:
+        from stereo_sfm.dense.volume import fuse
+
+        self.made += 1
+        return fuse(*args)
+
+
+def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(monkeypatch)
+    results, map_T_floor = module.build(case.given, tmp_path, VOXEL, 1)
+    numbers = write_all(results, tmp_path, VOXEL, map_T_floor)
+    made = case.made
+    assert made == len(results) > 1
+    written = {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
+
+    (tmp_path / "cubes" / sorted(p.name for p in (tmp_path / "cubes").iterdir())[0]).write_bytes(b"cut off")
+    write_all(*reversed_args(module.build(case.given, tmp_path, VOXEL, 1), tmp_path))
+    assert case.made == made + 1, "only the damaged cube is made again"
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == written, "the same bits"
+
+    vertices = np.frombuffer(written["mesh.ply"].partition(b"end_header\n")[2], np.uint8)
+    count = int(numbers["vertices"])
+    points = vertices[: 15 * count].reshape(-1, 15)[:, :12].copy().view("<f4")
+    ahead = points[(np.abs(points[:, 0]) < 0.5)]
+    assert np.median(np.abs(ahead[:, 1] - 2.0)) < 0.02, "the wall ahead, along y of the floor"
+    magic, version, size = struct.unpack("<4sII", written["mesh.glb"][:12])
+    assert (magic, version, size) == (b"glTF", 2, len(written["mesh.glb"]))
+    length = struct.unpack("<I", written["mesh.glb"][12:16])[0]
+    assert json.loads(written["mesh.glb"][20 : 20 + length])["accessors"][0]["count"] == count
+
+    about = yaml.safe_load(written["costmap.yaml"])
+    image = cv2.imread(str(tmp_path / about["image"]), 0)
+    assert image is not None
+    assert set(np.unique(image)) == {0, 205, 254}
+    row, column = (
+        image.shape[0] - 1 - int((y - about["origin"][1]) / VOXEL) if axis else int((y - about["origin"][0]) / VOXEL)
+        for axis, y in ((1, 2.0), (0, 0.0))
+    )
+    assert (image[row - 2 : row + 3, column] == 0).any(), "the wall is occupied"
+    assert image[row + 12, column] == 254, "the floor before it is free"
+
+
+def reversed_args(built: Any, folder: Path) -> tuple[Any, ...]:
+    return built[0], folder, VOXEL, built[1]
+
+
+def test_one_camera_has_depth_from_motion_alone() -> None:
+    frames = drive(2, right=False)
+    assert keyframe_depth(frames[0], None) is None
+    before = earlier(frames[:1], frames[1])
+    assert before is frames[0]
+    depth = keyframe_depth(frames[1], before)
+    assert depth is not None
+    points = depth.points()
+    sides = points[np.isfinite(points[..., 0]) & (points[..., 2] < 1.75) & (np.abs(points[..., 0]) > 0.8)]
+    assert len(sides) > 300
+    off = np.minimum(np.abs(sides[:, 0] + 1.0), np.abs(sides[:, 0] - 1.1))
+    assert np.median(off) < 0.02
+
+
+def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from stereo_sfm.maps.saved_map import save_map
+
+    def fails(*args: object) -> str:
+        assert main(["dense", *map(str, args)]) == 2
+        err = capsys.readouterr().err
+        assert len(err.strip().splitlines()) == 1
+        return err
+
+    assert "is not the folder of a run or a map" in fails(tmp_path / "none", "-o", tmp_path / "out")
+    save_map(small_map()[1], tmp_path / "store")
+    assert "--images SOURCE" in fails(tmp_path / "store", "-o", tmp_path / "out")
+    assert "no such file" in fails(tmp_path / "store", "-o", tmp_path / "out", "--images", "gone.mcap")
+    assert "--voxel" in fails(tmp_path / "store", "-o", tmp_path / "out", "--voxel", "0")

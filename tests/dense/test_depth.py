@@ -1,0 +1,95 @@
+"""Depth of a pair: exact disparities of rendered planes, standard deviations, geometry of every kind of view."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.dense.depth import disparities, pair_depth
+from stereo_sfm.dense.matching import match_both_ways
+from stereo_sfm.dense.views import PairView, motion_view, stereo_view
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.types import F64, U8
+from tests.synthetic import fisheye_rig, pinhole_rig
+
+
+def texture(seed: int = 3) -> U8:
+    noise = np.random.default_rng(seed).uniform(0, 255, (1200, 1200)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0)
+    return cv2.normalize(smooth, np.empty(0), 10, 245, cv2.NORM_MINMAX).astype(np.uint8)
+
+
+def render(camera: Camera, world_T_cam: F64, planes: list[tuple[int, float]]) -> tuple[U8, F64]:
+    """Textured walls across the axes (axis, place in metres) as a camera sees them, and the ranges."""
+    rays = camera.bearing_grid() @ world_T_cam[:3, :3].T
+    best, image = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape[:2], np.uint8)
+    for number, (axis, place) in enumerate(planes):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = (place - world_T_cam[axis, 3]) / rays[..., axis]
+            p = world_T_cam[:3, 3] + rays * r[..., None]
+        others = [k for k in range(3) if k != axis]
+        uv = np.nan_to_num((p[..., others] * 120 + 600), nan=0, posinf=0, neginf=0).astype(np.float32)
+        seen = cv2.remap(texture(number), uv[..., 0], uv[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        nearer = (r > 0) & (r < best)
+        image[nearer], best[nearer] = seen[nearer], r[nearer]
+    return image, best
+
+
+def truth_of(view: PairView, world_T_cam: F64, planes: list[tuple[int, float]]) -> F64:
+    turned = world_T_cam @ se3.from_rotation_translation(view.cam_R_view, np.zeros(3))
+    return render(view.camera, turned, planes)[1]
+
+
+@pytest.mark.parametrize("rig", [pinhole_rig(), fisheye_rig()], ids=["pinhole", "fisheye"])
+def test_a_pair_finds_walls_ahead_and_beside(rig: Rig) -> None:
+    planes = [(2, 2.0), (0, -1.2), (0, 1.3)]
+    left, _ = render(rig.left, np.eye(4), planes)
+    right, _ = render(rig.right, rig.left_T_right, planes)
+    view = stereo_view(rig, 0.5)
+    depth = pair_depth(view, left, right)
+    error = np.abs(depth.ranges / truth_of(view, np.eye(4), planes) - 1)
+    known = np.isfinite(depth.ranges)
+    assert known.mean() > 0.5
+    assert np.median(error[known]) < 0.01
+
+
+def test_two_keyframes_straight_ahead_are_a_pair() -> None:
+    """The epipole is in the middle of the image: no pinhole rectification exists."""
+    rig = fisheye_rig()
+    planes = [(0, -1.2), (0, 1.3), (2, 4.0)]
+    ahead = se3.exp(np.array([0.01, 0.0, 0.25, 0.0, 0.02, 0.0]))
+    images = [render(rig.left, pose, planes)[0] for pose in (np.eye(4), ahead)]
+    view = motion_view(rig.left, rig.left, ahead, 0.5 * rig.left.fx)
+    assert view is not None
+    depth = pair_depth(view, *images)
+    truth = truth_of(view, np.eye(4), planes)
+    near = np.isfinite(depth.ranges) & (truth < 2.5)
+    assert near.sum() > 2000
+    assert np.median(np.abs(depth.ranges / truth - 1)[near]) < 0.01
+
+
+def test_disparities_are_finer_than_the_matchers_and_know_how_fine() -> None:
+    shift = 6.3 + 0.04 * np.arange(300, dtype=np.float32)[None, :].repeat(200, 0)
+    u, v = np.meshgrid(np.arange(300, dtype=np.float32), np.arange(200, dtype=np.float32))
+    big = texture()
+    rng = np.random.default_rng(1)
+    right = cv2.remap(big, u + 100, v + 100, cv2.INTER_CUBIC)
+    left = cv2.remap(big, u - shift + 100, v + 100, cv2.INTER_CUBIC)
+    noisy = [np.clip(i + rng.normal(0, 2, i.shape), 0, 255).astype(np.uint8) for i in (left, right)]
+    found, sigma = disparities(noisy[0], noisy[1], 32)
+    error = np.abs(found - shift)
+    known = np.isfinite(found)
+    assert known.mean() > 0.8
+    matched = np.abs(match_both_ways(noisy[0], noisy[1], 32)[0] - shift)[known]
+    assert np.median(error[known]) < 0.8 * np.nanmedian(matched)
+    assert 0.55 < (error <= sigma)[known].mean() < 0.85
+    again = disparities(noisy[0], noisy[1], 32)
+    np.testing.assert_array_equal(again[0], found)
+
+
+def test_nothing_is_found_where_there_is_no_texture() -> None:
+    flat = np.full((100, 160), 90, np.uint8)
+    assert not np.isfinite(disparities(flat, flat, 16)[0]).any()
