@@ -20,17 +20,18 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogEnded, LogLine, MapSaved, Relocalize, SaveMap, Sink
 from stereo_sfm.pipeline.capture import OpenAgain, SourceInfo
-from stereo_sfm.pipeline.channels import Arrivals, End, Failed
+from stereo_sfm.pipeline.channels import Arrivals, End, Failed, pickled
 from stereo_sfm.pipeline.child import UPSTREAM_LOST, Ready, Setup
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.logger_link import BACKLOG
+from stereo_sfm.pipeline.loop_link import LoopLink
 from stereo_sfm.pipeline.stage_graph import OuterEnds, start_stages
 from stereo_sfm.pipeline.stage_processes import MIN_OPEN_FILES, StageProcesses, raise_file_limit
 from stereo_sfm.pipeline.text import Listener, emit
 from stereo_sfm.pipeline.viewer import ViewerOptions
 from stereo_sfm.pipeline.watchdog import Heartbeat, Watchdog
-from stereo_sfm.types import Applied, Frame, StereoImage
+from stereo_sfm.types import Applied, Frame, Keyframe, LoopResult, StereoImage
 
 log = logging.getLogger("stereo_sfm")
 
@@ -92,6 +93,7 @@ class ProcessRun:
         self._pose_first = pose_first
         self._stages = StageProcesses(config.pipeline.threads)
         self._outer = OuterEnds()
+        self._setup: Setup
         self._live = False  # the logger is never waited for
         self._abandoned = False
         self.began_s: float | None = None  # performance counter when every stage was ready
@@ -112,6 +114,11 @@ class ProcessRun:
         self._failure: StereoSfmError | None = None  # of the source: raised when all its images are processed
         self._listener = Listener("main", self.publish)
         self.info: SourceInfo
+
+    @property
+    def _loop(self) -> LoopLink:
+        assert self._outer.loop is not None
+        return self._outer.loop
 
     # -- life cycle ---------------------------------------------------------------------------------------------------
 
@@ -283,6 +290,8 @@ class ProcessRun:
             delays=self._delays,
             opening=self._folders.opening(self._opener.opening(info.rig)),
         )
+        self._loop.closing = self._config.closes_loops(info.rig.stereo, self._folders.localize_only)
+        self._setup = setup
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         if not self._live:
             self._held["mapper"] = [setup]
@@ -299,6 +308,10 @@ class ProcessRun:
 
         Until the tracker is ready, the mapper leaves it the processor; where poses come first, so do the others.
         """
+        if stage == "loop":
+            self._loop.ready()
+        if stage not in self._not_ready:  # of a process that follows one that has died
+            return
         self._not_ready.discard(stage)
         if not self._not_ready:
             self.began_s, self._ready_s = time.perf_counter(), time.monotonic()
@@ -356,6 +369,8 @@ class ProcessRun:
 
     def _dispatch(self, message: object, data: bytes | None = None) -> None:
         """Pass a message on; `data`: the same, pickled."""
+        if isinstance(message, LoopResult):
+            self._loop.answered(message, data or pickled(message))
         if isinstance(message, Compiling | Localized | MapSaved):
             self._saving_at_end &= not isinstance(message, MapSaved)
             for sink in self._sinks:
@@ -377,6 +392,14 @@ class ProcessRun:
                 self._give_up_log(f"the logger has not taken the last {BACKLOG} messages")
         elif isinstance(message, SlotImage) and message.logged:
             (self._images or self.release)(message)
+
+        if isinstance(message, Keyframe):
+            self._answer(self._loop.add(message, data or pickled(message)))
+
+    def _answer(self, results: list[LoopResult]) -> None:
+        """Loop results that no process has computed."""
+        for result in results:
+            self._dispatch(result)
 
     def release(self, message: SlotImage) -> None:
         """Return the slot of an image that `images` took; from any thread."""
@@ -411,9 +434,15 @@ class ProcessRun:
         self._request("mapper", Relocalize())
 
     def _end(self, connection: Connection, stage: str) -> None:
-        self._ended.add(stage)
         self._stages.reports.pop(connection, None)
         connection.close()
+        if stage == "tracker":
+            self._loop.end()
+        self._finished(stage)
+
+    def _finished(self, stage: str) -> None:
+        """The stage has sent its last message."""
+        self._ended.add(stage)
         if self._stages.processes.keys() - SINKS <= self._ended and stage not in SINKS:
             if self._outer.logger is not None:
                 self._outer.logger.end()
@@ -431,6 +460,8 @@ class ProcessRun:
         if stage == "logger" and self._live:
             self._give_up_log(f"the {stage} process {self._stages.how_it_died(stage)}")
             return
+        if stage == "loop" and self._loop_goes_on(f"the loop closer's process {self._stages.how_it_died(stage)}"):
+            return
         # What came before is processed; a service does not wait for that: it begins again.
         goes_on = self._capturing and self._folders.session is None
         if stage == "capture" and (self._stopped_s is not None or goes_on):
@@ -446,6 +477,21 @@ class ProcessRun:
         self._abandon()
         raise StageDied(f"{message}; {self._what_remains(stage)}")
 
+    def _loop_goes_on(self, why: str) -> bool:
+        """Have another process follow the loop closer's, else go on without loops; False: it could not even begin."""
+        link = self._loop
+        if not link.replaceable:
+            return False
+        self._answer(link.died("process ended"))
+        if link.follow():
+            log.warning("%s; it starts again", why)
+            self._watchdog.begun("loop", self.pids["loop"])
+            self._stages.request("loop", self._setup)
+        else:
+            log.warning("%s; the run goes on without it", why)
+            self._finished("loop")
+        return True
+
     def _what_remains(self, stage: str) -> str:
         return "the run has no log" if self._outer.logger is None else self._outer.logger.remains(stage)
 
@@ -459,6 +505,10 @@ class ProcessRun:
             self._stages.reports.pop(connection)
             self._give_up_log(f"the logger failed: {failed.message.strip().splitlines()[-1]}")
             return
+        if failed.stage == "loop" and not failed.ours:
+            self._stages.forget("loop")
+            if self._loop_goes_on(f"the loop closer's process failed: {failed.message.strip().splitlines()[-1]}"):
+                return
         if failed.stage == "capture" and self._capturing:
             self._failure = _error(failed)
             self._end(connection, failed.stage)

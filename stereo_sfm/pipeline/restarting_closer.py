@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from stereo_sfm.errors import StereoSfmError
@@ -57,6 +57,12 @@ class RestartingCloser:
         if result.candidate_kf_id >= 0:
             self._loops = [*filter(self._known, self._loops), result]
         return result
+
+    def resume(self, keyframes: Sequence[Keyframe], loops: Sequence[LoopResult]) -> None:
+        """Go on after another process, which ended at the last of its keyframes or after it, with what it knew."""
+        if keyframes:
+            self._keyframes, self._loops, self._proven = {k.kf_id: k for k in keyframes[:-1]}, list(loops), True
+            self._restart(keyframes[-1])
 
     def _known(self, loop: LoopResult) -> bool:
         return loop.kf_id in self._keyframes and loop.candidate_kf_id in self._keyframes

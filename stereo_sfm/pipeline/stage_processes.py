@@ -44,6 +44,8 @@ class StageProcesses:
     def spawn(self, stage: str, body: Callable[..., None], *arguments: Any) -> None:
         """Start a stage with `body(to_main, control, *arguments)`."""
         report, to_main = self.pipe()
+        if stage in self._controls:  # of a process that has ended
+            self._controls[stage].close()
         control, self._controls[stage] = self.pipe()
         process = self._context.Process(
             target=child.guarded, args=(stage, body, to_main, control, *arguments), name=f"stereo-sfm {stage}",

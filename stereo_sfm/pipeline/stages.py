@@ -7,7 +7,7 @@ mailbox is a deque that is never empty when it is read; between processes it is 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Protocol, TypeVar
 
 from stereo_sfm.calib.rig import Rig
@@ -77,6 +77,10 @@ class AnyCloser(Protocol):
     """Computes the loop results of keyframes."""
 
     def step(self, keyframe: Keyframe) -> LoopResult: ...
+
+    def resume(self, keyframes: Sequence[Keyframe], loops: Sequence[LoopResult]) -> None:
+        """Go on after another process, which ended at the last of its keyframes or after it, with what it knew."""
+        ...
 
 
 class TrackStage:

@@ -81,6 +81,10 @@ class Watchdog:
                 self._computed[stage] = _status(self._pids[stage])[1]
                 self._judge_step(message)
 
+    def begun(self, stage: str, pid: int) -> None:
+        """Another process of a stage follows one that has ended."""
+        self._pids[stage], self._received_s[stage], self._computed[stage] = pid, time.monotonic(), 0.0
+
     def excuse(self, seconds: float) -> None:
         """Ignore a time in which main did not receive messages."""
         self._received_s = {stage: at + seconds for stage, at in self._received_s.items()}

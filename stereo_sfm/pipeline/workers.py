@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -12,6 +13,7 @@ from stereo_sfm.messages import Localized
 from stereo_sfm.pipeline.allocator import Release, release_memory
 from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox, pickled
 from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
+from stereo_sfm.pipeline.loop_link import Known
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
 
@@ -76,7 +78,6 @@ def run_tracker(
     release: Connection,
     updates: Connection,
     to_mapper: Connection,
-    to_loop: Connection,
 ) -> None:
     """Images to frames and keyframes."""
     from stereo_sfm.messages import StageTimes
@@ -92,7 +93,7 @@ def run_tracker(
     tracker = make_tracker_with_places(setup.config, setup.rig, spans, setup.ground_truth)
     stage = TrackStage(tracker, _schedule(setup), PrefetchingInbox[MapUpdate](updates))
     inbox = Inbox[SlotImage | End](images)
-    free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))
+    free, keyframes = Outbox(release), Outbox(to_mapper)
     ready("tracker", setup, to_main)
     meter, tidy = HealthMeter("tracker", to_main.send), Release(RELEASE_IMAGES)
     frame_id = -1
@@ -110,17 +111,15 @@ def run_tracker(
                 if isinstance(output, Frame):
                     answered = time.monotonic()
                 if isinstance(output, Keyframe):
-                    for outbox in keyframes:
-                        outbox.send(data)
+                    keyframes.send(data)
         frame_id = image.frame_id
         to_main.send(StageTimes(frame_id, {**spans.take(), "latency": (answered - message.captured_s) * 1e3}))
         meter.add(frame_id, (time.monotonic() - begin) * 1e3, to_main.waiting())
         tidy.step()
         to_main.pulse.end()
     meter.report()
-    for outbox in keyframes:
-        outbox.send(End("tracker"))
-        outbox.close()
+    keyframes.send(End("tracker"))
+    keyframes.close()
     ring.close()
 
 
@@ -220,8 +219,8 @@ def run_optimizer(to_main: Report, control: Connection, jobs: Connection, result
     outbox.close()
 
 
-def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
-    """Keyframes to loop results."""
+def run_loop(to_main: Report, control: Connection, keyframes: Connection) -> None:
+    """Keyframes to loop results; main passes both on (`pipeline.loop_link`)."""
     from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
     from stereo_sfm.pipeline.stages import make_closer
@@ -231,24 +230,24 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
     delay = prepare("loop", setup)
     spans = Spans()
     closer = make_closer(setup.config, setup.rig, spans, setup.folders.localize_only)
-    inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
+    inbox = Inbox[Known | Keyframe | End](keyframes)
     ready("loop", setup, to_main)
     meter, tidy = HealthMeter("loop", to_main.send), Release(RELEASE_KEYFRAMES)
     frame_id = -1
-    while isinstance(keyframe := inbox.take(), Keyframe):
+    while not isinstance(keyframe := inbox.take(), End):
         if closer is None:
             continue
         to_main.pulse.begin()
+        if isinstance(keyframe, Known):
+            closer.resume([pickle.loads(data) for data in keyframe.keyframes], keyframe.loops)
+            to_main.pulse.end()
+            continue
         delay()
         begin = time.monotonic()
-        result = closer.step(keyframe)
-        data = pickled(result)
-        to_main.send(data)
-        outbox.send(data)
+        to_main.send(closer.step(keyframe))
         frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
         meter.add(frame_id, ms)
         tidy.step()
         to_main.pulse.end()
     meter.report()
-    outbox.close()

@@ -193,7 +193,7 @@ def test_a_stopped_process_is_named_and_the_run_ends_in_time(
     assert closed(path)
 
 
-def hanging_loop(to_main: Report, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
+def hanging_loop(to_main: Report, control: Connection, keyframes: Connection) -> None:
     """A loop closer that never responds."""
     Inbox[Setup](control).take()
     to_main.send(child.Ready("loop"))

@@ -1,7 +1,13 @@
-"""An error in the loop closer is reported, costs one keyframe its loop, and changes nothing in any wiring."""
+"""An error in the loop closer, or the end of its process, is reported, costs one keyframe its loop, and changes nothing
+else in any wiring."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import pickle
+import signal
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +23,11 @@ from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
 from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.pipeline import workers
+from stereo_sfm.pipeline.channels import Inbox, pickled
 from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.logger import LogOptions
+from stereo_sfm.pipeline.loop_link import LoopLink
+from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.restarting_closer import RestartingCloser
 from stereo_sfm.pipeline.schedule import Recorded
 from stereo_sfm.types import Keyframe, LoopResult
@@ -143,3 +153,106 @@ def test_inline_processes_and_replay_agree_across_an_error(
     assert [loop.kf_id for loop in loops if loop.failed] == [FAILS_AT]
     inline_log(c, SlidingWall(FRAMES), schedule=Recorded(run.applied))
     assert same(a, c) == []
+
+
+# -- its process -------------------------------------------------------------------------------------------------------
+
+
+def killed_step(self: LoopCloser, keyframe: Keyframe, step: Any = LoopCloser.step) -> LoopResult:
+    """Ends the process in the middle of a step."""
+    if keyframe.kf_id == FAILS_AT:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(self, keyframe)
+
+
+def run_killed_loop(*arguments: Any) -> None:
+    ready: Any = workers.ready
+
+    def then(*setup: Any) -> None:
+        ready(*setup)  # it has keyframes of its own
+        LoopCloser.step = killed_step  # type: ignore[method-assign]
+
+    workers.ready = then
+    workers.run_loop(*arguments)
+
+
+def run_raising_loop(to_main: Any, control: Any, keyframes: Any) -> None:
+    """A process whose error no closer catches."""
+    taken: Any = Inbox.take
+
+    def take(self: Any) -> Any:
+        message = taken(self)
+        if isinstance(message, Keyframe) and message.kf_id == FAILS_AT:
+            raise MemoryError
+        return message
+
+    Inbox.take = take  # type: ignore[method-assign]
+    workers.run_loop(to_main, control, keyframes)
+
+
+@pytest.mark.parametrize(("body", "how"), [(run_killed_loop, "was killed by SIGKILL"), (run_raising_loop, "failed:")])
+def test_a_process_that_ends_is_followed_by_another_with_the_keyframes_so_far(
+    body: Any, how: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The bits are those of a run whose closer failed there, but for the reason of that keyframe's result."""
+    a, b = tmp_path / "inline.mcap", tmp_path / "processes.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr(LoopCloser, "step", failing_step)
+        inline_log(a, SlidingWall(FRAMES))
+    monkeypatch.setattr("stereo_sfm.pipeline.stage_graph.workers.run_loop", body)
+    record = RunRecord.of(CONFIG)
+    with ProcessRun(MadeSource.of(SlidingWall, FRAMES), CONFIG, [record], log=LogOptions(b, "none")) as run:
+        first = run.pids["loop"]
+        assert len(list(run)) == FRAMES
+        assert run.pids["loop"] != first
+    assert f"the loop closer's process {how}" in caplog.text
+    assert "it starts again" in caplog.text
+    assert statistics(record, 1.0)["loop_errors_at"] == [FAILS_AT]
+    assert [d for d in same(a, b) if "/loop" not in d] == []
+
+
+def test_of_a_process_that_cannot_begin_again_every_keyframe_gets_a_result() -> None:
+    """And a process that ends again before a result begins without what it knew."""
+    (from_main, results), begun = multiprocessing.Pipe(duplex=False), list[Connection]()
+
+    def begin() -> Connection:
+        received, sent = multiprocessing.Pipe(duplex=False)
+        begun.append(received)
+        return sent
+
+    def step(k: int) -> None:
+        assert link.add(keyframe(k), pickled(keyframe(k))) == []
+        result = LoopResult.without_loop(k, "no_candidate")
+        link.answered(result, pickled(result))
+
+    def died() -> list[int]:
+        lost = link.died("process ended")
+        for result in lost:
+            assert result.failed
+            link.answered(result, pickled(result))
+        return [r.kf_id for r in lost]
+
+    link = LoopLink(begin, results)
+    assert not link.replaceable
+    link.ready()
+    for k in range(3):
+        step(k)
+    for k in (3, 4):
+        link.add(keyframe(k), pickled(keyframe(k)))
+    assert died() == [3]
+    assert link.follow()
+    known = begun[1].recv()
+    assert [pickle.loads(data).kf_id for data in known.keyframes] == [0, 1, 2, 3]
+    assert begun[1].recv().kf_id == 4
+    link.ready()
+    assert died() == [4]
+    assert link.follow()
+    assert begun[2].recv().keyframes == ()
+    link.add(keyframe(5), pickled(keyframe(5)))
+    assert died() == [5]  # not even ready
+    assert not link.follow()
+    assert [r.kf_id for r in link.add(keyframe(6), pickled(keyframe(6)))] == [6]
+    for end in begun:
+        end.close()
+    link.close()
+    assert [from_main.recv().kf_id for _ in range(6)] == list(range(6))

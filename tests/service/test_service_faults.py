@@ -82,6 +82,16 @@ def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: 
             assert sum(1 for _ in source) > 5
 
 
+def test_a_killed_loop_closer_costs_no_session(tmp_path: Path) -> None:
+    with running(config(tmp_path)) as watched:
+        pid = watched.service.pids["loop"]
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: watched.service.pids.get("loop") not in (None, pid))
+        watched.more_poses(60)
+        assert watched.no_pose_is_missing()
+        assert watched.service.status().data["health"]["restarts"] == 0
+
+
 def test_a_stage_that_gets_no_memory_is_started_again(tmp_path: Path) -> None:
     with running(config(tmp_path)) as watched:
         sessions = list[Started]()
