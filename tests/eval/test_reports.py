@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import csv
 import json
+import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stereo_sfm import timing
 from stereo_sfm.cli import main
 from stereo_sfm.eval.compare import names_of
+from stereo_sfm.eval.headline import headline
 from stereo_sfm.eval.html_page import take_plots, to_html
+from stereo_sfm.eval.report import verdicts
 from stereo_sfm.eval.tables import write_table
+from stereo_sfm.kernel_cache import Compilation
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +51,37 @@ def test_the_report_is_one_html_file_with_its_plots(runs: tuple[Path, Path]) -> 
         ids += [i for e in ElementTree.fromstring(svg).iter() if (i := e.get("id"))]
     assert len(ids) == len(set(ids))
     assert not list(runs[0].glob("*.svg"))
+
+
+def test_a_report_begins_with_one_sentence_and_the_picture(runs: tuple[Path, Path]) -> None:
+    blocks = (runs[0] / "report.md").read_text("utf-8").split("\n\n")
+    assert blocks[1].startswith(("**The camera's position is known for", "**This run failed**"))
+    assert blocks[1].count("\n") == 0 and blocks[2] == "![trajectory](trajectory.png)" and blocks[3] == "## Verdict"
+    assert "| latency |" not in "".join(blocks)  # a recording is read ahead
+
+
+def test_pass_is_more_than_poses(runs: tuple[Path, Path]) -> None:
+    stats = json.loads((runs[0] / "stats.json").read_text("utf-8"))
+    good = {**stats, "tracked": stats["frames"], "lost_percent": 0.0, "lost_intervals": [], "inliers_median": 200.0,
+            "pieces": 1, "start_check": None, "sensors": {}}  # fmt: skip
+    good["row_errors"] = {**stats["row_errors"], "warning": ""}
+    (line,) = verdicts(good, {})
+    assert line.startswith("**PASS**") and "200 points" in line and "row error" in line
+    assert "is known for all 15 images" in headline(good, {}, 0) and "no true path" in headline(good, {}, 0)
+    for fault in ({"inliers_median": 20.0}, {"pieces": 2}, {"row_errors": {**good["row_errors"], "warning": "x"}}):
+        lines = verdicts({**good, **fault}, {})
+        assert len(lines) == 1 and lines[0].startswith("**WARN**")
+    assert headline({**good, "tracked": 0}, {}, 0) == "**This run failed**: tracking never initialised."
+
+
+def test_compiling_is_no_time_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = Compilation(lambda _: None)
+    monkeypatch.setattr(timing, "_compilation", lambda: counted)
+    spans = timing.Spans()
+    with spans.span("track"):
+        time.sleep(0.02)
+        counted.seconds += 0.02
+    assert 0 <= spans.take()["track"] < 20
 
 
 def test_other_files_of_the_folder_stay(tmp_path: Path) -> None:
