@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -123,6 +124,22 @@ def test_runs_are_compared_on_one_page(runs: tuple[Path, Path], tmp_path: Path) 
     rows = rows_of(tmp_path / "compare.csv")
     assert [row["run"] for row in rows] == ["a", "b"]
     assert all(0 < float(row["ATE m"]) < 0.2 for row in rows) and rows[0]["hash"] != rows[1]["hash"]
+
+
+def test_two_runs_differ_as_a_table(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["diff", *map(str, runs), "-o", str(tmp_path)]) == 3
+    rows = {line.split("  ")[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    assert rows["run"][1:] == ["a", "b"] and rows["tracker.max_features"][1:] == ["150", "80"]
+    assert rows["hash"][1] != rows["hash"][2] and {"ATE m", "lost intervals", "corrections"} <= rows.keys()
+    assert not any(name.startswith("/") for name in rows)  # no topic
+    assert (tmp_path / "compare.html").is_file()
+    assert main(["diff", *map(str, runs), "--all"]) == 3 and "/" in capsys.readouterr().out
+    same = tmp_path / "same"
+    shutil.copytree(runs[0], same)
+    assert main(["diff", str(runs[0]), str(same)]) == 0 and "settings that differ" not in capsys.readouterr().out
+    assert main(["diff", str(runs[0]), str(runs[1] / "run.mcap")]) == 2
 
 
 def test_what_is_no_run_is_said(runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
