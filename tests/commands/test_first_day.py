@@ -16,8 +16,10 @@ import pytest
 import stereo_sfm as s
 from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.cli import main
+from stereo_sfm.config import Config
 from stereo_sfm.drivers.folder_source import FolderSource
 from stereo_sfm.drivers.source import Stamps
+from stereo_sfm.eval.batch import BatchTask, run_one
 from stereo_sfm.pixels import cut_off
 
 
@@ -136,3 +138,19 @@ def test_ablation_of_a_source_without_truth_is_refused(
 ) -> None:
     assert main(["ablation", f"images:{folder}", "-o", str(tmp_path / "a")]) == 2
     assert "has no ground truth to evaluate the cells against" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["pairs2", "pirs", "runs/pairs2", "camera"])
+def test_a_mistyped_folder_is_named_once(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for beside in ((), ("pairs",)):
+        for folder in beside:
+            (tmp_path / folder).mkdir()
+        assert main(["run", name]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"no such file or folder: {name}" in line and len(line) < 150
+        cell = run_one(BatchTask(name, str(tmp_path / "out" / "x"), Config(), map_out=False))["error"]
+        assert cell in line
+    assert ("did you mean pairs?" in line) == (name in ("pairs2", "pirs"))
