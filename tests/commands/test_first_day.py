@@ -20,7 +20,11 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.folder_source import FolderSource
 from stereo_sfm.drivers.source import Stamps
 from stereo_sfm.eval.batch import BatchTask, run_one
+from stereo_sfm.eval.evaluate import evaluate, table
 from stereo_sfm.pixels import cut_off
+from stereo_sfm.service.messages import ServiceState
+from stereo_sfm.service.states import REMEDIES
+from stereo_sfm.types import Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -154,3 +158,23 @@ def test_a_mistyped_folder_is_named_once(
         cell = run_one(BatchTask(name, str(tmp_path / "out" / "x"), Config(), map_out=False))["error"]
         assert cell in line
     assert ("did you mean pairs?" in line) == (name in ("pairs2", "pirs"))
+
+
+def test_terms_on_the_screen_are_in_the_glossary() -> None:
+    glossary = (Path(__file__).parents[2] / "docs" / "glossary.md").read_text("utf-8")
+    for term in ("row error", "decentering", "not confirmed yet", "significant", "step", "refined", "drift"):
+        assert any(term in line.split("|")[1] for line in glossary.splitlines() if line.startswith("| ")), term
+
+
+def test_equations_of_a_thesis_are_no_row_of_eval() -> None:
+    stamps = np.arange(4) * 10**8
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = np.arange(4)
+    path = Trajectory(stamps, poses)
+    rows = table(evaluate(path, path, "origin"))
+    assert rows and not any("thesis" in name for name, _ in rows)
+
+
+def test_a_full_disk_names_the_settings_that_help() -> None:
+    remedy = REMEDIES[ServiceState.DISK_FULL]
+    assert "recording.quota_gb" in remedy and "recording.min_free_gb" in remedy
