@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     if args.output is not None:
         raise StereoSfmError("diff: --output is for two folders of runs, without --topics and --all")
     paths = [path / "run.mcap" if path.is_dir() else path for path in (args.a, args.b)]
-    return _logs(paths[0], paths[1], args)
+    return _logs(paths[0], paths[1], list(args.topics), float(args.tol), bool(args.all))
 
 
 def _runs(folders: list[Path], output: Path | None) -> int:
@@ -61,21 +61,21 @@ def _table(rows: list[list[str]]) -> list[str]:
     return [f"{what:<{widths[0]}}  {one:<{widths[1]}}  {other}".rstrip() for what, one, other in rows]
 
 
-def _logs(path_a: Path, path_b: Path, args: argparse.Namespace) -> int:
+def _logs(path_a: Path, path_b: Path, only: list[str], tolerance: float, everything: bool) -> int:
     """The first difference of two logs."""
     from stereo_sfm.log.diff import configurations, diff
     from stereo_sfm.log.reader import LogReader
 
     with LogReader(path_a) as a, LogReader(path_b) as b:
-        found = diff(a, b, args.topics, args.tol)
+        found = diff(a, b, only, tolerance)
         changed = configurations(a, b)
     if not found:
         print("identical")
         return 0
-    for difference in found if args.all else found[:1]:
+    for difference in found if everything else found[:1]:
         print(difference)
     more = len(found) - 1
-    if more and not args.all:
+    if more and not everything:
         print(f"and {more} more topic{'s differ' if more > 1 else ' differs'} (--all shows where)")
     if changed:
         print("the configurations differ: " + "; ".join(changed[:5]))
