@@ -95,6 +95,7 @@ def replace(switch: str) -> list[str]:
 
 def inject(step: str) -> list[Any]:
     """Have the source of the run turn its right camera; the list gets that source."""
+    importlib.import_module("stereo_sfm.same_code")  # before OpenCV: the bits are those of other runs
     from _real_inject import Turned
 
     choice, turned = importlib.import_module("stereo_sfm.drivers.choice"), list[Any]()
