@@ -160,7 +160,7 @@ def _depth(task: Any) -> KeptDepth | None:
             return None
         _write(path, key, _depth_columns(found))
     seen = Seen(found, floor_T_cam, session)
-    return KeptDepth(path, key, floor_T_cam, session, seen.reach, tuple(sorted(touched(seen, voxel))))
+    return KeptDepth(path, key, floor_T_cam, session, seen.reach(voxel), tuple(sorted(touched(seen, voxel))))
 
 
 def _depth_key(now: KeyframeImages, before: KeyframeImages | None) -> str:
