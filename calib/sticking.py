@@ -84,13 +84,14 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
         if part.any()
     ]
     text = f"{' and '.join(shares)} sticks to the image while the rest moves (projector dots, dirt, the robot itself)"
-    masked = without_sticking(finding.rig or rig, parts)
+    masked = without_sticking(rig, parts)
     if masked is None:
         text = f"{text}: too much to be masked: turn the projector off, or clean the lens"
     if finding.text:
-        known = masked if finding.rig is not None else None
-        return replace(finding, text=f"{finding.text}; and {text}", rig=known or finding.rig, shown=True)
-    return replace(finding, text=text, rig=masked, shown=True, advice=MASK)
+        corrected = finding.rig and without_sticking(finding.rig, parts)
+        text, rig = f"{finding.text}; and {text}", corrected or finding.rig
+        return replace(finding, text=text, rig=rig, shown=True, masked=masked)
+    return replace(finding, text=text, shown=True, advice=MASK, masked=masked)
 
 
 def without_sticking(rig: Rig, parts: Sequence[Bool]) -> Rig | None:
