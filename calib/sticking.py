@@ -88,7 +88,7 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
     if masked is None:
         text = f"{text}: too much to be masked: turn the projector off, or clean the lens"
     if finding.text:
-        corrected = finding.rig and without_sticking(finding.rig, parts)
+        corrected = None if finding.rig is None else without_sticking(finding.rig, parts)
         text, rig = f"{finding.text}; and {text}", corrected or finding.rig
         return replace(finding, text=text, rig=rig, shown=True, masked=masked)
     return replace(finding, text=text, shown=True, advice=MASK, masked=masked)
