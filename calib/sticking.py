@@ -89,8 +89,8 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
         text = f"{text}: too much to be masked: turn the projector off, or clean the lens"
     if finding.text:
         corrected = None if finding.rig is None else without_sticking(finding.rig, parts)
-        text, rig = f"{finding.text}; and {text}", corrected or finding.rig
-        return replace(finding, text=text, rig=rig, shown=True, masked=masked)
+        text = f"{finding.text}; and {text}"
+        return replace(finding, text=text, rig=corrected or finding.rig, shown=True, masked=masked)
     return replace(finding, text=text, shown=True, advice=MASK, masked=masked)
 
 
