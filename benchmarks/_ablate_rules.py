@@ -26,6 +26,13 @@ def _rule(name: str, file: str, old: str, new: str) -> Rule:
 RULES = (
     # The mixture of motions.
     _rule(
+        "influence of new points",
+        SOLVER,
+        "contradicted = self._contradicted(tracks, expected, best)",
+        "contradicted = None",
+    ),
+    _rule("leverage points", SOLVER, "best = self._without_leverage_points(tracks, expected, static, best)", "pass"),
+    _rule(
         "motion of long-static points",
         SOLVER,
         "found = [agreed, by_settled, other, by_near]",

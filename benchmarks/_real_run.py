@@ -66,6 +66,7 @@ REPLACED: dict[str, dict[str, Any]] = {
         "stereo_sfm.mapping.self_calibration:SelfCalibration._detect_step": _none,
     },
     "people": {
+        f"{FLOW}.frame_pose:FramePoseSolver._contradicted": _none,
         f"{FLOW}.frame_pose:FramePoseSolver._judge": lambda self, tracks, expected, last, best, before: best,
         f"{FLOW}.frame_pose:FramePoseSolver.alert": property(lambda self: False),
         f"{FLOW}.tracker:after_frame": Wrapped(_nothing_moves),
