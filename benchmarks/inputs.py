@@ -149,10 +149,13 @@ def run(case: Case, cases: Path) -> tuple[str, str]:
         out, text, code = Path(folder) / "out", "", 0
         for command in case.commands:
             words = [w.format(**{"in": cases / case.file, "out": out, "cases": cases}) for w in shlex.split(command)]
-            done = subprocess.run(
-                [sys.executable, "-m", "stereo_sfm.cli", *words], capture_output=True, text=True, timeout=TIMEOUT_S,
-                env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=folder,
-            )  # fmt: skip
+            try:
+                done = subprocess.run(
+                    [sys.executable, "-m", "stereo_sfm.cli", *words], capture_output=True, text=True, timeout=TIMEOUT_S,
+                    env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=folder,
+                )  # fmt: skip
+            except subprocess.TimeoutExpired:
+                return "WRONG", f"'{words[0]}' did not end within {TIMEOUT_S} s"
             text, code = text + done.stdout + done.stderr, done.returncode
             if code not in (0, 3, 4):
                 break

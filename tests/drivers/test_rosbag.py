@@ -61,7 +61,7 @@ def test_a_folder_without_metadata(kind: str, tmp_path: Path) -> None:
         assert [image.stamp_ns for image in bag] == [image.stamp_ns for image in images]
     only = next(folder.iterdir())
     shutil.copy(only, only.with_name(f"second{only.suffix}"))
-    with pytest.raises(StereoSfmError, match="2 files and no metadata.yaml: 'ros2 bag reindex"):
+    with pytest.raises(StereoSfmError, match=r"2 files and no metadata\.yaml: 'ros2 bag reindex"):
         open_source(folder)
 
 
