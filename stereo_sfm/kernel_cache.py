@@ -124,6 +124,13 @@ class Compilation(event.Listener):
             self.seconds += time.perf_counter() - self._since
 
 
+def count_compilation() -> Compilation:
+    """A `Compilation` that listens as long as this process lives."""
+    listener = Compilation(lambda _: None)
+    event.register(COMPILING, listener)
+    return listener
+
+
 @contextmanager
 def listening(report: Callable[[str], None]) -> Generator[Compilation]:
     """Report the name of every kernel compiled in the `with` block, not of those loaded from the cache."""

@@ -44,6 +44,17 @@ def declared_size(data: bytes) -> tuple[int, int]:
     return width, height
 
 
+def cut_off(data: bytes) -> bool:
+    """Whether a PNG or JPEG file ends before its image does: OpenCV fills the rest with grey or black.
+
+    A PNG ends with the chunk IEND. A JPEG has an end marker after its last start of a scan; both are
+    unambiguous, as a scan's own bytes of 255 are followed by zero.
+    """
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" not in data
+    return data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+
+
 def decode(data: bytes, flags: int) -> np.ndarray[Any, Any]:
     """The pixels of an image file as OpenCV's `flags` want them.
 
@@ -51,6 +62,8 @@ def decode(data: bytes, flags: int) -> np.ndarray[Any, Any]:
         ValueError: not an image file, damaged, or too large.
     """
     declared_size(data)
+    if cut_off(data):
+        raise ValueError("a compressed image is cut off")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
 from stereo_sfm.errors import StereoSfmError, writing_to
+
+if TYPE_CHECKING:
+    from stereo_sfm.eval.compare import ComparedRun
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,25 +37,9 @@ def run(args: argparse.Namespace) -> int:
     """Write the page and print where it is."""
     options = typed(CompareOptions, args)
     from stereo_sfm.commands._browser import show
-    from stereo_sfm.commands.eval import estimate_file, load, own_truth
-    from stereo_sfm.drivers.ground_truth import read_trajectory
     from stereo_sfm.eval import compare
 
-    names = compare.names_of(options.runs)
-    if len(set(names)) < len(names):
-        raise StereoSfmError("compare: the same run is named twice")
-    found: list[compare.ComparedRun] = []
-    for name, folder in zip(names, options.runs, strict=True):
-        stats = compare.stats_of(folder)
-        if options.ref is not None:
-            estimate, truth = load(folder, None, options.ref)
-        else:
-            estimate = read_trajectory(estimate_file(folder, None))
-            try:
-                truth = own_truth(folder)
-            except StereoSfmError:
-                truth = None
-        found.append(compare.ComparedRun(name, stats, estimate, truth))
+    found = load_runs(options.runs, options.ref)
     with writing_to(options.output):
         options.output.mkdir(parents=True, exist_ok=True)
         page = compare.compare(found, options.output)
@@ -58,3 +47,31 @@ def run(args: argparse.Namespace) -> int:
     if options.open:
         show(page)
     return 0
+
+
+def load_runs(folders: Sequence[Path], ref: str | None = None) -> list[ComparedRun]:
+    """The runs in these folders, with the ground truth in `ref`, else with their own if they have it.
+
+    Raises:
+        StereoSfmError: one is not the folder of a run, or is named twice.
+    """
+    from stereo_sfm.commands.eval import estimate_file, load, own_truth
+    from stereo_sfm.drivers.ground_truth import read_trajectory
+    from stereo_sfm.eval import compare
+
+    names = compare.names_of(folders)
+    if len(set(names)) < len(names):
+        raise StereoSfmError("the same run is named twice")
+    found: list[ComparedRun] = []
+    for name, folder in zip(names, folders, strict=True):
+        stats = compare.stats_of(folder)
+        if ref is not None:
+            estimate, truth = load(folder, None, ref)
+        else:
+            estimate = read_trajectory(estimate_file(folder, None))
+            try:
+                truth = own_truth(folder)
+            except StereoSfmError:
+                truth = None
+        found.append(compare.ComparedRun(name, stats, estimate, truth))
+    return found

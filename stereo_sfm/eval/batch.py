@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import time
 import traceback
 from collections.abc import Iterator, Sequence
@@ -35,8 +36,8 @@ class BatchTask:
 
 
 def names(recordings: Sequence[str]) -> list[str]:
-    """A unique folder name for each recording, in order."""
-    stems = [Path(r).stem or r for r in recordings]
+    """A unique folder name for each recording, in order: of characters that need no quotes in a shell."""
+    stems = [re.sub(r"[^\w.-]+", "_", Path(r).stem or r).strip("_") for r in recordings]
     taken = {s for s in stems if stems.count(s) == 1}
     out: list[str] = []
     for stem in stems:
@@ -60,7 +61,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     from stereo_sfm.pipeline.session import Session, Wiring
 
     cv2.setNumThreads(1)
-    folder, begin, record = Path(task.folder), time.perf_counter(), RunRecord.of(task.config)
+    folder, record = Path(task.folder), RunRecord.of(task.config)
     result: dict[str, Any] = {"recording": task.spec, "config": dump(task.config), "node": os.uname().nodename}
     try:
         prepare_folder(folder, overwrite=True)
@@ -68,10 +69,11 @@ def run_one(task: BatchTask) -> dict[str, Any]:
         opener = SourceChoice(task.spec)
         with closing(Session(opener, task.config, [record], Wiring(inline=True), folders, folder, True)) as session:
             with session:
+                begin = time.perf_counter()
                 for _ in session:
                     pass
+                wall_s = time.perf_counter() - begin - session.waited_s(begin)
             info = session.info
-            wall_s = time.perf_counter() - begin
             stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
         result |= {"ok": True, "stats": stats}
     except StereoSfmError as error:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,50 @@ def compare(runs: Sequence[ComparedRun], folder: Path) -> Path:
         encoding="utf-8",
     )
     return page
+
+
+def differences(runs: Sequence[ComparedRun]) -> list[list[str]]:
+    """Two runs as rows of text: what, the one, the other; the first row has their names."""
+    reference = next((run.reference for run in runs if run.reference is not None), None)
+    evaluations = _evaluations(runs, reference)
+    columns = zip(*(_row(run, evaluations.get(run.name)) for run in runs), strict=True)
+    rows = [[name, *(_text(name, value) for value in values)] for name, values in zip(COLUMNS, columns, strict=True)]
+    more: dict[str, Callable[[dict[str, Any]], str]] = {
+        "lost intervals": lambda stats: str(len(stats["lost_intervals"])),
+        "dropped": lambda stats: str(stats["dropped"]),
+        "submaps": lambda stats: str(stats["pieces"]),
+        "corrections": lambda stats: "; ".join(c["text"] for c in stats["calibration"]) or "none",
+    }
+    return rows + [[name, *(read(run.stats) for run in runs)] for name, read in more.items()]
+
+
+def changed_settings(folders: Sequence[Path]) -> list[list[str]]:
+    """The settings in which two runs differ, as rows: name, the one, the other.
+
+    Raises:
+        StereoSfmError: a config.toml cannot be read.
+    """
+    one, other = (_settings(folder / "config.toml") for folder in folders)
+    names = [*one, *(name for name in other if name not in one)]
+    return [[n, one.get(n, "-"), other.get(n, "-")] for n in names if one.get(n) != other.get(n)]
+
+
+def _settings(path: Path) -> dict[str, str]:
+    """Values as text by dotted name."""
+    try:
+        tree = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, ValueError):
+        raise StereoSfmError(f"{path} cannot be read: is this the folder of a run?") from None
+    found: dict[str, str] = {}
+    waiting: list[tuple[str, Any]] = [("", tree)]
+    while waiting:
+        name, value = waiting.pop()
+        if isinstance(value, dict):
+            items: dict[str, Any] = value
+            waiting += [(f"{name}.{key}" if name else key, part) for key, part in reversed(items.items())]
+        else:
+            found[name] = str(value)
+    return found
 
 
 def _evaluations(runs: Sequence[ComparedRun], reference: Trajectory | None) -> dict[str, Evaluation]:

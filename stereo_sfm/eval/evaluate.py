@@ -176,19 +176,6 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
                 f"{result.drift.segments} segments of {low:g} to {high:g} m ({note})",
             )
         )
-    if result.retail is not None:
-        e = result.retail
-        rows += [
-            (
-                "error between frames (retail thesis, eq. 23, 24)",
-                f"{e.relative_rotation_rad_mean:.3e} ± {e.relative_rotation_rad_std:.1e} rad, "
-                f"{e.relative_translation_m2_mean:.3e} ± {e.relative_translation_m2_std:.1e} m²",
-            ),
-            (
-                "error of the last frame (retail thesis, eq. 23, 24)",
-                f"{e.absolute_rotation_rad:.3e} rad, {e.absolute_translation_m2:.3e} m²",
-            ),
-        ]
     return rows
 
 

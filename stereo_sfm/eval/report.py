@@ -10,6 +10,7 @@ from typing import Any
 from stereo_sfm.eval import plots
 from stereo_sfm.eval.calibration_results import calibration_table
 from stereo_sfm.eval.evaluate import Evaluation, table
+from stereo_sfm.eval.headline import headline, passed
 from stereo_sfm.eval.html_page import take_plots, to_html
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.sensor_results import sensor_lines
@@ -62,8 +63,13 @@ def write_report(
         evaluations: of the estimates, by the same names, where there is ground truth.
         go_on: called before each plot; when it returns False, the remaining ones are omitted.
     """
-    lines = [f"# {source_name}", "", *(f"* {line}" for line in summary(stats, evaluations)), "", "## Verdict", ""]
-    lines += [f"* {verdict}" for verdict in verdicts(stats, evaluations)]
+    drawings = _plots_by_name(folder, record, stats, estimates, evaluations)
+    judged = verdicts(stats, evaluations)
+    warnings = sum(line.startswith("**WARN**") for line in judged)
+    lines = [f"# {source_name}", "", headline(stats, evaluations, warnings), ""]
+    lines += ["![trajectory](trajectory.png)", ""] if "trajectory" in drawings else []
+    lines += ["## Verdict", "", *(f"* {verdict}" for verdict in judged), ""]
+    lines += ["## Summary", "", *(f"* {line}" for line in summary(stats, evaluations))]
     for name, result in evaluations.items():
         lines += ["", f"## {name.capitalize()} against ground truth", "", "| | |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in table(result)]
@@ -76,18 +82,17 @@ def write_report(
     lines += _lost_intervals(stats["lost_intervals"]) + _gaps(stats["stamp_gaps"])
     lines += _rejections(stats["loops_rejected"])
     lines += ["", "## Time per stage", "", "| stage | p50 | p95 | p99 | frames |", "|---|---|---|---|---|"]
-    for stage, ms in stats["ms"].items():
+    shown = {stage: ms for stage, ms in stats["ms"].items() if stage != "latency" or stats["camera"]}
+    for stage, ms in shown.items():
         count = thousands(int(ms["frames"]))
         lines.append(f"| {stage} | {ms['p50']:.2f} ms | {ms['p95']:.2f} ms | {ms['p99']:.2f} ms | {count} |")
     lines += [
         "",
-        "`track`, `map` and `loop` are the stages and run in parallel; the other rows are steps of them. `latency` is",
+        "`track`, `map` and `loop` are the stages and run in parallel; the other rows are steps of them. Compiling the",
+        "kernels, once after an installation, is left out.",
     ]
-    lines += [
-        "the time from the arrival of an image to its pose. The images of a recording are read ahead and wait in the",
-        "queues: there it is no measure of speed, and the plot below omits it.",
-    ]
-    drawings = _plots_by_name(folder, record, stats, estimates, evaluations)
+    if "latency" in shown:
+        lines.append("`latency` is the time from the arrival of an image to its pose; the plot omits it.")
     with (folder / "report.md").open("w", encoding="utf-8") as report:
         report.write("\n".join([*lines, "", _glossary(folder), ""]))
         for name, draw in drawings.items():
@@ -96,7 +101,8 @@ def write_report(
                 report.write("\nFurther plots were omitted: the run was interrupted.\n")
                 break
             draw()
-            report.write(f"\n![{name}]({name}.png)\n")
+            if name != "trajectory":  # it is at the beginning
+                report.write(f"\n![{name}]({name}.png)\n")
     page = to_html(source_name, (folder / "report.md").read_text("utf-8"), take_plots(folder, drawings))
     (folder / "report.html").write_text(page, encoding="utf-8")
 
@@ -189,9 +195,6 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
     reasons = sorted({interval["reason"] for interval in stats["lost_intervals"]})
     if reasons:
         out += [f"**WARN**: tracking was lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
-    elif stats["tracked"]:
-        dropped = ", except those dropped by capture" if stats["dropped_by_capture"] else ""
-        out.append(f"**PASS**: every frame after the first pose has a pose{dropped}")
     if stats["pieces"] > 1:
         out.append(
             f"**WARN**: the map is in {stats['pieces']} unconnected submaps: tracking restarted, and no place of one "
@@ -205,7 +208,12 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
         out.append(
             f"**WARN**: only {stats['inliers_median']:.0f} points per frame: check texture, exposure and calibration"
         )
+    if stats["row_errors"] is not None and stats["row_errors"]["warning"]:
+        rows = stats["row_errors"]["systematic_px"]
+        out.append(f"**WARN**: the calibration does not fit the images (row error {rows:.2f} px): see check-calib")
     out += [text for name, result in evaluations.items() if (text := _length(name, result))]
+    if not out and stats["tracked"]:
+        out.append(passed(stats))
     return out or ["no frames"]
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stereo_sfm.calib.lengths import unchecked_lengths
 from stereo_sfm.calib.lens_doubts import doubts
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.start import check_start
@@ -100,8 +101,9 @@ def describe_file(path: Path, rig: Path | None = None) -> Description:
     Raises:
         StereoSfmError: no such file, or not MCAP.
     """
-    with _without_duplicates():
-        return _describe_file(path, rig)
+    with _warnings() as warned:
+        out = _describe_file(path, rig)
+    return _with_warnings(out, warned)
 
 
 def _describe_file(path: Path, own_rig: Path | None) -> Description:
@@ -140,21 +142,29 @@ def _describe_file(path: Path, own_rig: Path | None) -> Description:
 
 
 @contextmanager
-def _without_duplicates() -> Generator[None]:
-    """The file is opened as a log and as a source: a warning of both is shown once."""
-    seen = set[str]()
+def _warnings() -> Generator[list[str]]:
+    """What readers warn about while a recording is opened and read: each is listed once, and not shown."""
+    found: dict[str, None] = {}
 
-    def new(record: logging.LogRecord) -> bool:
-        text = record.getMessage()
-        before = len(seen)
-        seen.add(text)
-        return len(seen) > before
+    def keep(record: logging.LogRecord) -> bool:
+        if record.levelno < logging.WARNING:
+            return True
+        found[record.getMessage()] = None
+        return False
 
-    log.addFilter(new)
+    texts: list[str] = []
+    log.addFilter(keep)
     try:
-        yield
+        yield texts
     finally:
-        log.removeFilter(new)
+        log.removeFilter(keep)
+        texts += found
+
+
+def _with_warnings(out: Description, warned: list[str]) -> Description:
+    """Add the warnings that no problem says already: what a run would warn about is a problem."""
+    out.problems += [text for text in warned if not any(problem in text or text in problem for problem in out.problems)]
+    return out
 
 
 def describe_dataset(spec: str | Path, rig: Path | None = None) -> Description:
@@ -168,8 +178,9 @@ def describe_dataset(spec: str | Path, rig: Path | None = None) -> Description:
     from stereo_sfm.drivers.source import path_of
 
     out = Description(str(spec), "folder" if path_of(str(spec)).is_dir() else "bag")
-    _describe_source(out, spec, rig)
-    return out
+    with _warnings() as warned:
+        _describe_source(out, spec, rig)
+    return _with_warnings(out, warned)
 
 
 def _describe_infos(out: Description, reader: LogReader) -> None:
@@ -232,22 +243,27 @@ def _describe_source(out: Description, spec: str | Path, rig: Path | None) -> No
         if out.kind != "mcap":
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
-        out.problems += _unlit(source, len(stamps)) or _against_calibration(source)
+        broken, unlit = _unseen(source, len(stamps))
+        out.problems += [*broken, *(unlit or _against_calibration(source))]
+        lengths = unchecked_lengths(source.rig, source)
+        out.calibration += [lengths] if lengths else []
     out.problems += _problems(out)
 
 
-def _unlit(source: Source, count: int) -> list[str]:
-    """Sampled frames in which a camera sees nothing: from all of a folder, else the first ones, if all of them."""
+def _unseen(source: Source, count: int) -> tuple[list[str], list[str]]:
+    """Sampled frames that cannot be read or show nothing: from all of a folder, else the first ones, if all of them."""
     spread = isinstance(source, FolderSource)  # images between are not read
     some = min(SAMPLED, count)
     positions = sorted({k * (count - 1) // max(some - 1, 1) for k in range(some)}) if spread else range(some)
     try:
         unlit = [_shows_nothing(image) for image in source.at(positions)]
     except StereoSfmError as error:
-        return [str(error)]
+        return [], [str(error)]
+    unread = some - len(unlit) if spread else 0
+    broken = [f"{unread} of {some} sampled frames cannot be read: damaged or missing files"] if unread else []
     of, least = f"of {len(unlit)} sampled frames", 1 if spread else max(len(unlit), 1)
     counts = ((unlit.count(what), what) for what in (NO_LIGHT, NO_CONTRAST))
-    return [f"{n} {of} have {what}" for n, what in counts if n >= least]
+    return broken, [f"{n} {of} have {what}" for n, what in counts if n >= least]
 
 
 def _against_calibration(source: Source) -> list[str]:
@@ -257,7 +273,7 @@ def _against_calibration(source: Source) -> list[str]:
         found = with_sticking(found, source.rig, source.at(positions(source.frame_count)))
     except StereoSfmError as error:
         return [str(error)]
-    if not found.shown:
+    if not found.text:
         return []
     done = "corrects" if found.rig is not None else "masks" if found.masked is not None else ""
     return [f"{found.text}: a run {done} it at its start; {found.advice}" if done else found.text]

@@ -16,7 +16,7 @@ LOST_NS = 500_000_000  # without a pose, of the images' time: a frame or two are
 REMEDIES = {
     ServiceState.LOST: "drive slowly back to where the camera has been, or where it sees shelves well lit",
     ServiceState.CAMERA_GONE: "check the camera's cable; it is reconnected automatically",
-    ServiceState.DISK_FULL: "free space on the disk, or lower recording.quota_gb; poses continue",
+    ServiceState.DISK_FULL: "free disk space, or lower recording.quota_gb or recording.min_free_gb; poses continue",
 }
 
 

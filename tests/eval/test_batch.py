@@ -23,6 +23,9 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 def test_names_are_unique() -> None:
     assert batch.names(["a/x.mcap", "b/x.mcap", "y.mcap"]) == ["x_1", "x_2", "y"]
+    assert batch.names(["sim:loop?size=424x400&seed=1", "sim:loop?seed=2", "tour 2.mcap"]) == [
+        "sim_loop_size_424x400_seed_1", "sim_loop_seed_2", "tour_2",
+    ]  # fmt: skip
 
 
 def test_a_result_of_another_configuration_is_not_reused(tmp_path: Path) -> None:

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
+import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stereo_sfm import timing
 from stereo_sfm.cli import main
 from stereo_sfm.eval.compare import names_of
+from stereo_sfm.eval.headline import headline
 from stereo_sfm.eval.html_page import take_plots, to_html
+from stereo_sfm.eval.report import verdicts
 from stereo_sfm.eval.tables import write_table
+from stereo_sfm.kernel_cache import Compilation
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +52,37 @@ def test_the_report_is_one_html_file_with_its_plots(runs: tuple[Path, Path]) -> 
         ids += [i for e in ElementTree.fromstring(svg).iter() if (i := e.get("id"))]
     assert len(ids) == len(set(ids))
     assert not list(runs[0].glob("*.svg"))
+
+
+def test_a_report_begins_with_one_sentence_and_the_picture(runs: tuple[Path, Path]) -> None:
+    blocks = (runs[0] / "report.md").read_text("utf-8").split("\n\n")
+    assert blocks[1].startswith(("**The camera's position is known for", "**This run failed**"))
+    assert blocks[1].count("\n") == 0 and blocks[2] == "![trajectory](trajectory.png)" and blocks[3] == "## Verdict"
+    assert "| latency |" not in "".join(blocks)  # a recording is read ahead
+
+
+def test_pass_is_more_than_poses(runs: tuple[Path, Path]) -> None:
+    stats = json.loads((runs[0] / "stats.json").read_text("utf-8"))
+    good = {**stats, "tracked": stats["frames"], "lost_percent": 0.0, "lost_intervals": [], "inliers_median": 200.0,
+            "pieces": 1, "start_check": None, "sensors": {}}  # fmt: skip
+    good["row_errors"] = {**stats["row_errors"], "warning": ""}
+    (line,) = verdicts(good, {})
+    assert line.startswith("**PASS**") and "200 points" in line and "row error" in line
+    assert "is known for all 15 images" in headline(good, {}, 0) and "no true path" in headline(good, {}, 0)
+    for fault in ({"inliers_median": 20.0}, {"pieces": 2}, {"row_errors": {**good["row_errors"], "warning": "x"}}):
+        lines = verdicts({**good, **fault}, {})
+        assert len(lines) == 1 and lines[0].startswith("**WARN**")
+    assert headline({**good, "tracked": 0}, {}, 0) == "**This run failed**: tracking never initialised."
+
+
+def test_compiling_is_no_time_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = Compilation(lambda _: None)
+    monkeypatch.setattr(timing, "_compilation", lambda: counted)
+    spans = timing.Spans()
+    with spans.span("track"):
+        time.sleep(0.02)
+        counted.seconds += 0.02
+    assert 0 <= spans.take()["track"] < 20
 
 
 def test_other_files_of_the_folder_stay(tmp_path: Path) -> None:
@@ -87,6 +124,22 @@ def test_runs_are_compared_on_one_page(runs: tuple[Path, Path], tmp_path: Path) 
     rows = rows_of(tmp_path / "compare.csv")
     assert [row["run"] for row in rows] == ["a", "b"]
     assert all(0 < float(row["ATE m"]) < 0.2 for row in rows) and rows[0]["hash"] != rows[1]["hash"]
+
+
+def test_two_runs_differ_as_a_table(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["diff", *map(str, runs), "-o", str(tmp_path)]) == 3
+    rows = {line.split("  ")[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    assert rows["run"][1:] == ["a", "b"] and rows["tracker.max_features"][1:] == ["150", "80"]
+    assert rows["hash"][1] != rows["hash"][2] and {"ATE m", "lost intervals", "corrections"} <= rows.keys()
+    assert not any(name.startswith("/") for name in rows)  # no topic
+    assert (tmp_path / "compare.html").is_file()
+    assert main(["diff", *map(str, runs), "--all"]) == 3 and "/" in capsys.readouterr().out
+    same = tmp_path / "same"
+    shutil.copytree(runs[0], same)
+    assert main(["diff", str(runs[0]), str(same)]) == 0 and "settings that differ" not in capsys.readouterr().out
+    assert main(["diff", str(runs[0]), str(runs[1] / "run.mcap")]) == 2
 
 
 def test_what_is_no_run_is_said(runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
