@@ -32,7 +32,7 @@ from stereo_sfm.types import F64, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "1"  # of the files: grows when the same input gives other bits
+VERSION = "2"  # of the files: grows when the same input gives other bits
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
 Report = Callable[[str, int, int], None]  # what, done, of
 

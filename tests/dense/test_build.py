@@ -102,6 +102,19 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     assert image[row + 12, column] == 254, "the floor before it is free"
 
 
+@pytest.mark.slow  # starts two processes
+def test_two_processes_write_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(monkeypatch)
+    case.frames = case.frames[:2]
+    for jobs in (1, 2):
+        folder = tmp_path / str(jobs)
+        results, map_T_floor = module.build(case.given, folder, 0.08, jobs)
+        write_all(results, folder, 0.08, map_T_floor)
+    one, two = ({p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*.*")} for n in "12")
+    assert len(one) > 8
+    assert one == two
+
+
 def reversed_args(built: Any, folder: Path) -> tuple[Any, ...]:
     return built[0], folder, VOXEL, built[1]
 
