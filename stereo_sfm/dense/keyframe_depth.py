@@ -23,6 +23,7 @@ BEST_M = 0.3
 VIEW_PX = 640  # longest side of a view: finer ones cost more than a voxel of 2 cm shows
 STEP = 2  # px of a view between depths: a voxel of 2 cm at 2.5 m and 200 px a radian
 AGREE_SIGMAS = 3.0
+SPACING_M, SPACING_DEG = 0.25, 15.0  # between keyframes with depth: a shelf 1 m away is still seen by several
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,13 @@ def earlier(keyframes: Sequence[KeyframeImages], now: KeyframeImages) -> Keyfram
     apart = [float(np.linalg.norm(k.map_T_cam[:3, 3] - now.map_T_cam[:3, 3])) for k in keyframes]
     good = [i for i, d in enumerate(apart) if MOTION_M[0] <= d <= MOTION_M[1]]
     return keyframes[min(good, key=lambda i: abs(apart[i] - BEST_M))] if good else None
+
+
+def shows_more(last: KeyframeImages, now: KeyframeImages) -> bool:
+    """Whether the camera moved or turned enough since `last` for a depth image of its own."""
+    moved = se3.inverse(last.map_T_cam) @ now.map_T_cam
+    turned = 0.5 * (np.trace(moved[:3, :3]) - 1) < np.cos(np.deg2rad(SPACING_DEG))
+    return bool(turned or np.linalg.norm(moved[:3, 3]) >= SPACING_M)
 
 
 def keyframe_depth(now: KeyframeImages, before: KeyframeImages | None) -> DepthImage | None:
