@@ -20,7 +20,7 @@ import yaml
 from stereo_sfm.cli import main
 from stereo_sfm.dense import build as module
 from stereo_sfm.dense import inputs
-from stereo_sfm.dense.files import write_all
+from stereo_sfm.dense.files import write_all, write_heights
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -107,6 +107,17 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     )
     assert (image[row - 2 : row + 3, column] == 0).any(), "the wall is occupied"
     assert image[row + 12, column] == 254, "the floor before it is free"
+
+
+def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
+    x, y = (a.ravel() * 0.1 for a in np.mgrid[:10, :10])
+    below = np.stack([x, y, np.where(x < 0.5, 0.0, 1.5)], axis=1)
+    ceiling = np.stack([x, y, np.full(100, 2.8)], axis=1)
+    pictures = []
+    for points in (below, np.concatenate([below, ceiling])):
+        write_heights(tmp_path / "height.png", points, 0.1)
+        pictures.append(cv2.imread(str(tmp_path / "height.png")))
+    np.testing.assert_array_equal(*pictures)
 
 
 @pytest.mark.slow  # starts two processes
