@@ -113,11 +113,11 @@ def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
     x, y = (a.ravel() * 0.1 for a in np.mgrid[:10, :10])
     below = np.stack([x, y, np.where(x < 0.5, 0.0, 1.5)], axis=1)
     ceiling = np.stack([x, y, np.full(100, 2.8)], axis=1)
-    pictures = []
+    pictures: list[Any] = []
     for points in (below, np.concatenate([below, ceiling])):
         write_heights(tmp_path / "height.png", points, 0.1)
         pictures.append(cv2.imread(str(tmp_path / "height.png")))
-    np.testing.assert_array_equal(*pictures)
+    np.testing.assert_array_equal(pictures[0], pictures[1])
 
 
 @pytest.mark.slow  # starts two processes

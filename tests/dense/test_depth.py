@@ -110,5 +110,5 @@ def test_a_view_of_every_second_pixel_has_the_same_ranges() -> None:
     for rig in (pinhole_rig(), fisheye_rig()):
         view = stereo_view(rig, 0.3)
         disparity = np.full((view.camera.height, view.camera.width), 4.0, np.float32)
-        coarse = view.every(2).ranges(disparity[::2, ::2] / 2)
+        coarse = view.every(2).ranges(np.asarray(disparity[::2, ::2] / 2, np.float32))
         np.testing.assert_allclose(coarse, view.ranges(disparity)[::2, ::2], rtol=1e-5)
