@@ -132,6 +132,8 @@ def _integrate(distance, weight, views, grey, ranges, sigmas, image, coarse, mod
                 if away > radius and 1.5 * params[0] * radius < TILE * (away - radius):
                     found = project_one(model, params, px, py, pz)
                     u, v = found[0], found[1]
+                    if not (-TILE <= u < w + TILE and -TILE <= v < h + TILE):
+                        continue  # outside the view, as the block is smaller than a tile there
                     if 0 <= u < w and 0 <= v < h and away - radius > coarse[int(v) // TILE, int(u) // TILE] + cut:
                         continue  # behind everything around, or nothing was measured
                 for i in range(bx, bx + BLOCK):
