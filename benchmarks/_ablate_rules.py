@@ -26,7 +26,14 @@ def _rule(name: str, file: str, old: str, new: str) -> Rule:
 RULES = (
     # The mixture of motions.
     _rule(
-        "motion of settled points",
+        "influence of new points",
+        SOLVER,
+        "contradicted = self._contradicted(tracks, expected, best)",
+        "contradicted = None",
+    ),
+    _rule("leverage points", SOLVER, "best = self._without_leverage_points(tracks, expected, static, best)", "pass"),
+    _rule(
+        "motion of long-static points",
         SOLVER,
         "found = [agreed, by_settled, other, by_near]",
         "found = [agreed, other, by_near]",
@@ -56,7 +63,7 @@ RULES = (
     _rule("confirmed by known points", SOLVER, "if usual and self._confirmed(chosen, known, MIN_GROUP):", "if False:"),
     _rule("implausible motion", SOLVER, "and self._plausible(s.pose, expected)]", "]"),
     _rule(
-        "undivided points",
+        "consistent points",
         SOLVER,
         'return best if undivided or not self.alert else _no_pose(len(tracks), "no_consensus")',
         "return best",
@@ -80,7 +87,7 @@ RULES = (
         "ALERT_S if moving else 0.0",
     ),
     _rule(
-        "prior of settled points",
+        "prior of long-static points",
         SOLVER,
         "self._optimise(tracks, expected, settled, expected)",
         "self._optimise(tracks, expected, settled)",
@@ -95,7 +102,10 @@ RULES = (
     _rule("start at rest", SOLVER, "if best.inliers < 0.5 * np.count_nonzero(static):", "if False:"),
     _rule("noise is learned", SOLVER, "self._learn_noise(tracks, solution, seconds)\n        if", "if"),
     _rule(
-        "noise of settled points", SOLVER, "if np.count_nonzero(settled) < 2 * self._config.min_features:", "if True:"
+        "noise of long-static points",
+        SOLVER,
+        "if np.count_nonzero(settled) < 2 * self._config.min_features:",
+        "if True:",
     ),
     _rule("moving points are marked", TRACKER, "MAX_MISSES, self._solver.alert, static)", "MAX_MISSES, False, static)"),
     _rule(
@@ -153,19 +163,19 @@ RULES = (
     _rule("robot at rest", "tracking/inertial/rest.py", "if not still or not sensors_still():", "if True:"),
     # The relocalizer.
     _rule(
-        "more of a covered view",
+        "more of an occluded view",
         TRACKER,
         "if not self._part.wanted(self._follower.held, image.stamp_ns):\n            return None",
         "return None",
     ),
     _rule("no new points from a part", TRACKER, "if self._recovery.free or not uncertain:", "if True:"),
     _rule(
-        "the better held image",
+        "the better reference image",
         FOLLOWER,
         "if self._held is None or self._in_view(image, later) >= self._in_view(self._held, later):",
         "if True:",
     ),
-    _rule("more held points", TRACKER, "        self._hold_more()\n        expected", "        expected"),
+    _rule("more reference points", TRACKER, "        self._hold_more()\n        expected", "        expected"),
     _rule(
         "recall by distance from the prediction",
         RECOVERY,
@@ -180,24 +190,24 @@ RULES = (
     ),
     _rule("cells per metre", TRACKER, "CELLS_PER_METRE * expected.sigma_m)", "1.0)"),
     _rule(
-        "covered cells do not count",
+        "occluded cells do not count",
         TRACKER,
         "self._follower.recall(found_again, solution.pose, seen, ",
         "self._follower.recall(found_again, solution.pose, None, ",
     ),
     _rule(
-        "share of a free view",
+        "share of an unobstructed view",
         RECOVERY,
         "self.free = bool(np.minimum(self._occupied(corners), self._rows).sum() >= FREE_SHARE * self._cells)",
         "self.free = True",
     ),
     _rule(
-        "rows of a free view",
+        "rows of an unobstructed view",
         RECOVERY,
         "np.minimum(self._occupied(corners), self._rows).sum()",
         "self._occupied(corners).sum()",
     ),
-    _rule("covered time counts a tenth", LOSS, "max(self._free_s, COVERED_SHARE * self._covered_s)", "self._free_s"),
+    _rule("occluded time counts a tenth", LOSS, "max(self._free_s, COVERED_SHARE * self._covered_s)", "self._free_s"),
     _rule(
         "recent places",
         RECOVERY,

@@ -66,6 +66,7 @@ REPLACED: dict[str, dict[str, Any]] = {
         "stereo_sfm.mapping.self_calibration:SelfCalibration._detect_step": _none,
     },
     "people": {
+        f"{FLOW}.frame_pose:FramePoseSolver._contradicted": _none,
         f"{FLOW}.frame_pose:FramePoseSolver._judge": lambda self, tracks, expected, last, best, before: best,
         f"{FLOW}.frame_pose:FramePoseSolver.alert": property(lambda self: False),
         f"{FLOW}.tracker:after_frame": Wrapped(_nothing_moves),
@@ -95,6 +96,7 @@ def replace(switch: str) -> list[str]:
 
 def inject(step: str) -> list[Any]:
     """Have the source of the run turn its right camera; the list gets that source."""
+    importlib.import_module("stereo_sfm.same_code")  # before OpenCV: the bits are those of other runs
     from _real_inject import Turned
 
     choice, turned = importlib.import_module("stereo_sfm.drivers.choice"), list[Any]()

@@ -296,7 +296,7 @@ def many_saves(t: Target) -> Outcome:
         begin = time.monotonic()
         code, said = t.tell("/api/command/save_map", "POST", b"{}", **given)
         reply = json.loads(said) if code == 200 else {"ok": False, "text": said or "no reply"}
-        return time.monotonic() - begin, reply["ok"], reply["text"]
+        return time.monotonic() - begin, bool(reply["ok"]), str(reply["text"])
 
     with ThreadPoolExecutor(4) as pool:
         replies = list(pool.map(save, range(16)))

@@ -101,6 +101,7 @@ def store_pairs(folder: Path, count: int) -> None:
     uv = cameras[0].project(view.camera.bearing_grid() @ view.cam_R_view.T)
     at = np.nan_to_num(uv, nan=-9).astype(np.float32)
     errors, base_errors, held, coverage = [], [], [], []
+    paired: list[F64] = []  # (2, N) relative errors, signed, where both have a range
     for path in sorted((folder / "left").iterdir())[:: max(1, PAIRS // count)]:
         left, right = (cv2.imread(str(folder / side / path.name), 0) for side in ("left", "right"))
         stored = cv2.imread(str(folder / "range" / f"{path.stem}.png"), cv2.IMREAD_UNCHANGED)
@@ -115,6 +116,7 @@ def store_pairs(folder: Path, count: int) -> None:
         held.append((np.abs(depth.ranges - truth) <= depth.sigmas)[known])
         both = near & np.isfinite(base)
         base_errors.append(np.abs(base / truth - 1)[both])
+        paired.append(np.stack([depth.ranges / truth - 1, base / truth - 1])[:, known & both])
         coverage.append((known.sum() / near.sum(), both.sum() / near.sum()))
     ours, base = np.concatenate(errors), np.concatenate(base_errors)
     density = 100 * np.mean(coverage, axis=0)
@@ -124,6 +126,12 @@ def store_pairs(folder: Path, count: int) -> None:
             f"  {name}: median {100 * np.median(found):.2f} %, 90 % below {100 * np.quantile(found, 0.9):.2f} %", end=""
         )
         print(f", density {d:.1f} %")
+    ours, base = np.concatenate(paired, axis=1)
+    for name, found in (("ours", ours), ("SGBM", base)):
+        print(
+            f"  {name}, where both have a range: median {100 * np.median(np.abs(found)):.2f} %"
+            f", median with its sign {100 * np.median(found):+.2f} %"
+        )
     print(f"  within one standard deviation {100 * np.concatenate(held).mean():.1f} %")
 
 

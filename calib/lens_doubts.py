@@ -1,4 +1,4 @@
-"""What numbers of a calibration say about themselves: a fisheye under another name, lengths in other units.
+"""What numbers of a calibration say about themselves: a fisheye under another name, lengths in other units, scales.
 
 A fisheye's four coefficients k1 k2 k3 k4 under the name of the radial-tangential model are taken for k1 k2 p1 p2. As
 tangential distortion, k3 and k4 would be a lens that is tilted by several degrees: no factory mounts one like that.
@@ -19,6 +19,7 @@ log = logging.getLogger("stereo_sfm")
 MOST_TILTED_DEG = 2.0
 NEAREST_M = 1.0  # a stereo camera for a robot or a car shows half of its view to both cameras at this distance
 LEAST_FAR_M = 1.0  # and can tell this distance from infinity, by a pixel
+MOST_SCALE = 1.6  # of one image by the other: rendered pairs are matched from 0.6 to 1.25, not at 0.5 and 2
 
 
 def tilt_deg(camera: Camera) -> float:
@@ -50,7 +51,7 @@ def believable(cameras: list[Camera], where: str) -> list[Camera]:
 
 
 def doubts(rig: Rig) -> list[str]:
-    """Sizes that are unusual for a stereo camera of these lenses, one line each: a unit that is not metres?"""
+    """Sizes that are unusual for a stereo camera of these lenses, one line each."""
     if rig.second_camera is None:
         return []
     reach = rig.left.fx * rig.baseline  # metres times pixels of disparity
@@ -64,4 +65,10 @@ def doubts(rig: Rig) -> list[str]:
         found.append(f"{millimetres} lenses that then see depth up to {reach:.2g} m: {remedy}")
     if rig.left_T_right[0, 3] < -0.5 * rig.baseline:
         found.append("the right camera is to the left of the left one: are the two exchanged, or the sign of Tx?")
+    scale = rig.second_camera.fx / rig.left.fx
+    if max(scale, 1 / scale) > MOST_SCALE:
+        found.append(
+            f"the right image shows things {scale:.2g} times as large as the left one, so that few are found in both: "
+            "'--rectify pinhole' or '--rectify wide' makes them equally large"
+        )
     return found

@@ -45,6 +45,7 @@ class StartFinding:
     shift: int = 0  # left image k belongs to right image k + shift
     shown: bool = False  # by the images; False: only a guess, for a tracker that does not start
     advice: str = ADVICE  # what a user can do besides
+    masked: Rig | None = None  # the given calibration with masks of what sticks to the images; None: nothing does
 
 
 def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:

@@ -7,6 +7,7 @@ looks the same in nearly all of them belongs to the camera.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -20,7 +21,6 @@ from stereo_sfm.calib.mask_search import (
     MIN_VOTES,
     WINDOW,
     FixedVotes,
-    Moments,
     moments,
 )
 from stereo_sfm.calib.rig import Rig
@@ -28,7 +28,7 @@ from stereo_sfm.calib.start import StartFinding
 from stereo_sfm.types import U8, Bool, StereoImage
 
 IMAGES, WITHIN = 8, 150  # looked at, among so many first ones; they are denser in the beginning
-PAIRS_BEFORE_NOTHING = 3  # images that show nothing in so many pairs end the search
+PAIRS_BEFORE_NOTHING = 3  # images of which so many pairs show no change, or nothing that stays, end the search
 CELLS = 8  # of the image, in each direction
 STRONG = 12.0  # grey levels, standard deviation in windows that tell whether the view changes: no noise hides them
 CHANGED, CHANGED_CELLS = 0.02, 0.5  # of a cell's windows, and of the cells that have such windows
@@ -61,6 +61,8 @@ def sticking(images: Iterable[StereoImage]) -> list[Bool]:
         cameras = cameras or [_Camera() for _ in views]
         for camera, view in zip(cameras, views, strict=False):
             camera.add(view)
+            if camera.rests:
+                return []
         if all(camera.empty for camera in cameras):
             return []
     if not all(camera.moves for camera in cameras):
@@ -84,13 +86,14 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
         if part.any()
     ]
     text = f"{' and '.join(shares)} sticks to the image while the rest moves (projector dots, dirt, the robot itself)"
-    masked = without_sticking(finding.rig or rig, parts)
+    masked = without_sticking(rig, parts)
     if masked is None:
         text = f"{text}: too much to be masked: turn the projector off, or clean the lens"
     if finding.text:
-        known = masked if finding.rig is not None else None
-        return replace(finding, text=f"{finding.text}; and {text}", rig=known or finding.rig, shown=True)
-    return replace(finding, text=text, rig=masked, shown=True, advice=MASK)
+        corrected = None if finding.rig is None else without_sticking(finding.rig, parts)
+        text = f"{finding.text}; and {text}"
+        return replace(finding, text=text, rig=corrected or finding.rig, shown=True, masked=masked)
+    return replace(finding, text=text, shown=True, advice=MASK, masked=masked)
 
 
 def without_sticking(rig: Rig, parts: Sequence[Bool]) -> Rig | None:
@@ -104,28 +107,47 @@ def without_sticking(rig: Rig, parts: Sequence[Bool]) -> Rig | None:
     return replace(rig, left_mask=masks[0], right_mask=masks[1] if len(masks) > 1 else rig.right_mask)
 
 
+class _View:
+    """An image and what it is compared by."""
+
+    def __init__(self, image: U8) -> None:
+        self._image, self.moments = image, moments(image)
+
+    @functools.cached_property
+    def corners(self) -> Bool:
+        """(H, W) what is no straight edge: one along the motion shows the same for as long as the camera drives."""
+        eigen = np.asarray(cv2.cornerEigenValsAndVecs(self._image, CORNER_PX, 3))[..., :2]
+        return eigen.min(-1) > MIN_ROUND * eigen.max(-1)
+
+
 class _Camera:
     """What all counted pairs of one camera's images have in common."""
 
     def __init__(self) -> None:
-        self._seen: list[tuple[Moments, Bool]] = []
+        self._seen: list[_View] = []
         self._votes: FixedVotes | None = None
 
     def add(self, image: U8) -> None:
-        new, corners = moments(image), _corners(image)
-        self._votes = self._votes or FixedVotes(new.deviation.shape)
-        for old, old_corners in self._seen:
-            if _view_changes(*old.compared(new, STRONG)):
-                both = corners & old_corners
-                textured, matching = old.compared(new)
+        new = _View(image)
+        self._votes = self._votes or FixedVotes(image.shape)
+        for old in self._seen:
+            if _view_changes(*old.moments.compared(new.moments, STRONG)):
+                both = new.corners & old.corners
+                textured, matching = old.moments.compared(new.moments)
                 self._votes.add(textured & both, matching & both)
-        self._seen.append((new, corners))
+        self._seen.append(new)
 
     @property
     def empty(self) -> bool:
         """Whether enough pairs were compared to know that nothing sticks."""
         pairs = self._votes.pairs if self._votes is not None else 0
         return pairs >= PAIRS_BEFORE_NOTHING and not self.part(PAIRS_BEFORE_NOTHING).any()
+
+    @property
+    def rests(self) -> bool:
+        """Whether the first images all show the same."""
+        none = self._votes is None or not self._votes.pairs
+        return none and len(self._seen) * (len(self._seen) - 1) // 2 >= PAIRS_BEFORE_NOTHING
 
     @property
     def moves(self) -> bool:
@@ -137,7 +159,7 @@ class _Camera:
         """(H, W) what the windows that stay cover, off the rim of what is dark, such as a fisheye's: no corners lie
         there; nothing if it is too small."""
         assert self._votes is not None
-        brightest = np.maximum.reduce([one.mean for one, _ in self._seen])
+        brightest = np.maximum.reduce([one.moments.mean for one in self._seen])
         lit = uncovered(brightest > DARK * np.median(brightest), WINDOW)
         windows = _parts(self._votes.fixed(min_votes), lit, self._votes)
         return ~uncovered(~windows, WINDOW // 2) if windows.mean() > LEAST else np.zeros_like(windows)
@@ -151,12 +173,6 @@ def _view_changes(textured: Bool, matching: Bool) -> bool:
     )
     telling = share > CHANGED
     return bool(telling.any()) and float((changed > CHANGED)[telling].mean()) > CHANGED_CELLS
-
-
-def _corners(image: U8) -> Bool:
-    """(H, W) what is no straight edge: one along the motion shows the same for as long as the camera drives."""
-    eigen = np.asarray(cv2.cornerEigenValsAndVecs(image, CORNER_PX, 3))[..., :2]
-    return eigen.min(-1) > MIN_ROUND * eigen.max(-1)
 
 
 def _parts(stays: Bool, lit: Bool, votes: FixedVotes) -> Bool:

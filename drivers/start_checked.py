@@ -109,6 +109,8 @@ class StartCheckedSource(WrappedSource):
             remedy, rig, shift = f"corrected for this run; {finding.advice}", _as_text(better), finding.shift
         elif better is not None:
             remedy = f"not corrected, as self-calibration does not correct here; {finding.advice}"
+        elif finding.masked is not None:
+            remedy, rig = f"masked for this run; {finding.advice}", _as_text(finding.masked)  # which corrects nothing
         check = StartCheck(first.frame_id, first.stamp_ns, finding.text, remedy, finding.shown, rig, shift)
         if check.shown:
             log.warning("%s", check.line)

@@ -34,6 +34,7 @@ NEEDS = {
     "tasks/batch.md": "recordings, Ray; tests/eval/test_batch.py runs it",
     "tasks/debug.md": "a recording that was lost",
     "tasks/evaluate.md": "runs; tests/eval run each",
+    "tasks/dense.md": "a run with images; tests/dense run it",
     "ablation.md": "hours; tests/eval/test_ablation.py runs a cell",
     "concepts/inertial.md": "nothing: settings",
     "concepts/frames.md": "nothing: a drawing",

@@ -145,7 +145,7 @@ def _recognise_file(path: Path) -> str | None:
             "kalibr": "cam0:",
             "kitti": "P0:",
         }
-    return next((name for name, mark in marks.items() if mark in text), None)
+    return next((name for name, mark in marks.items() if mark in f"\n{text}"), None)
 
 
 def _function(name: str, which: int) -> Callable[..., Any]:

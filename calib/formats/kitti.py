@@ -83,9 +83,10 @@ def _size(path: Path, entries: dict[str, list[float]], index: int) -> tuple[int,
         width, height = numbers(stated, 2)
         return int(width), int(height)
     folders = (path.parent / f"image_{index}", path.parent / f"image_{index:02d}" / "data")
-    from stereo_sfm.pixels import declared_size
+    from stereo_sfm.pixels import SUFFIXES, declared_size
 
-    for image in (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20]):
-        with suppress(ValueError, OSError):
-            return declared_size(image.read_bytes())
+    for folder in filter(Path.is_dir, folders):
+        for image in sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)[:20]:
+            with suppress(ValueError, OSError):
+                return declared_size(image.read_bytes())
     raise ValueError("no image size stated, and no readable image next to the file")

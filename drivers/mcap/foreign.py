@@ -40,6 +40,7 @@ from stereo_sfm.drivers.mcap.messages import (
 from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
 from stereo_sfm.drivers.mcap.topics import ChosenTopics, camera_topic, choose_topics, is_rectified
+from stereo_sfm.drivers.mcap.video import KEYFRAMES_NS, VideoDecoder
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_camera
@@ -84,6 +85,8 @@ class ForeignSource(BaseSource):
         self._joints = [name for name in options.joints.split(",") if name]
         self._unreadable = 0  # images of the last reading
         self._read_forward()
+        first = self._first_left()
+        self._video = first.encoding if first and first.video else ""
         self._clock = self._found_clock()
         self.rig = self._with_wheel(self._with_imu(chosen_rig(options.rig, self._recorded_rig)))
         if self.topics.depth:
@@ -204,6 +207,9 @@ class ForeignSource(BaseSource):
         names = [t for t in (self.topics.left, self._other()) if t]
         lefts: deque[_StampedImage] = deque()
         others: deque[_StampedImage] = deque()
+        decoder = VideoDecoder()
+        if start_ns is not None and self._video:
+            self._decode_before(start_ns, names, decoder)
         for record in self.reader.messages([*names, *samples], start_ns, until_ns):
             if record.topic in self.topics.imu:
                 reading = _imu_reading(record, self.topics)
@@ -213,7 +219,7 @@ class ForeignSource(BaseSource):
                 turned = _wheel_reading(record)
                 wheel += [self._on_clock(turned, record)] if turned is not None else []
                 continue
-            image = self._image_of(record)
+            image = self._shown(self._image_of(record), record.topic, decoder)
             if image is None:
                 continue
             if len(names) == 1:
@@ -235,6 +241,20 @@ class ForeignSource(BaseSource):
                 yield lefts.popleft(), None
             if sum(len(x.message.data) for x in others) > _WAITING_BYTES:
                 others.popleft()
+
+    def _decode_before(self, start_ns: int, names: list[str], decoder: VideoDecoder) -> None:
+        """What a video's first image needs from before it."""
+        for record in self.reader.messages(names, start_ns - KEYFRAMES_NS, start_ns - 1):
+            self._shown(self._image_of(record), record.topic, decoder)
+
+    def _shown(self, image: _StampedImage | None, topic: str, decoder: VideoDecoder) -> _StampedImage | None:
+        """The image that a message of a video completes; others are as they are."""
+        if image is None or not image.message.video:
+            return image
+        with suppress(*BAD_MESSAGE):
+            found = decoder.decoded(topic, image.message, image.stamp_ns)
+            return None if found is None else _StampedImage(*found)
+        return None
 
     def _on_clock(self, reading: Reading, record: Record) -> Reading:
         """A sample with its stamp on the clock of the images."""
@@ -332,8 +352,11 @@ class ForeignSource(BaseSource):
         return Trajectory(np.array([row.stamp_ns for row in rows], np.int64), poses)
 
     def _left_frame(self) -> str:
-        first = next((self._image_of(r) for r in self.reader.messages([self.topics.left])), None)
-        return first.message.frame if first else ""
+        first = self._first_left()
+        return first.frame if first else ""
+
+    def _first_left(self) -> ImageMessage | None:
+        return next((self._message_of(r) for r in self.reader.messages([self.topics.left])), None)
 
     def _sample(self, count: int) -> Iterator[Any]:
         """Readable images of both cameras at evenly spaced times."""
@@ -349,13 +372,15 @@ class ForeignSource(BaseSource):
     def _check_first(self) -> None:
         """Raises StereoSfmError before the first frame if the images cannot be read or do not match the calibration."""
         used = ((left, other) for left, other in self._pairs(None, None, [], []) if self._used(other))
-        why = None
+        why: Exception | str | None = None
         for left, other in itertools.islice(used, FIRST):
             try:
                 self._decoded(0, left, other, 0)
                 return
             except BAD_MESSAGE as error:
                 why = error
+        if why is None and self._video:
+            why = f"'{self._video}' video without a keyframe"
         if why is not None:
             raise StereoSfmError(f"{self.name}: its images cannot be read: {why}")
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -21,14 +22,14 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows
-from stereo_sfm.calib.side_names import words_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, images
 from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import decode_gray
 from stereo_sfm.types import F32, F64, U8, U16
 
-VIDEO = {"h", "hevc", "av", "vp"}  # words of "h264", "H265", "hevc", "av1", "vp9"
+# Parts of the names that encoders go by (libx264, hevc_nvenc) -> FFmpeg's decoder.
+VIDEO = {"264": "h264", "265": "hevc", "hevc": "hevc", "av1": "libdav1d", "vp8": "vp8", "vp9": "vp9"}
 NOTHING = (float("nan"),) * 3  # what is not measured
 # Exceptions of damaged or unexpected messages.
 BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
@@ -48,6 +49,12 @@ class ImageMessage:
     encoding: str = ""
     big_endian: bool = False
 
+    @property
+    def video(self) -> str:
+        """FFmpeg's decoder of a message that is a part of a video, "" for an image of its own."""
+        name = self.encoding.lower() if self.compressed else ""
+        return next((decoder for part, decoder in VIDEO.items() if part in name), "")
+
     def gray(self) -> U8 | U16:
         """(H, W) with the depth of the message.
 
@@ -55,8 +62,8 @@ class ImageMessage:
             UnknownEncoding: no image of the topic can be read.
             ValueError: this one cannot.
         """
-        if self.compressed and not VIDEO.isdisjoint(words_of(self.encoding)):
-            raise images.UnknownEncoding(f"'{self.encoding}' images are video, which is not supported")
+        if self.video:  # `stereo_sfm.drivers.mcap.video` decodes those of recordings
+            raise images.UnknownEncoding(f"'{self.encoding}' is video, which is read from recordings only")
         if self.compressed:
             return decode_gray(self.data)
         return images.decode_raw(self.data, self.width, self.height, self.step, self.encoding, self.big_endian)
@@ -150,6 +157,11 @@ def _image_foxglove_compressed(data: bytes) -> ImageMessage:
     return ImageMessage(foxglove.stamp_of(m), m.frame_id, True, m.data, encoding=m.format)
 
 
+def _video_foxglove(data: bytes) -> ImageMessage:
+    m = CompressedVideo.FromString(data)
+    return ImageMessage(foxglove.stamp_of(m), m.frame_id, True, m.data, encoding=m.format)
+
+
 def _image_ros_raw(data: bytes) -> ImageMessage:
     cdr = _Cdr(data)
     stamp_ns, frame = cdr.header()
@@ -166,6 +178,24 @@ def _image_ros_compressed(data: bytes) -> ImageMessage:
     if "compressedDepth" in encoding:  # the depth transport has a header before the PNG
         blob = blob[blob.find(b"\x89PNG") :]
     return ImageMessage(stamp_ns, frame, True, blob, encoding=encoding)
+
+
+def _video_ros(data: bytes) -> ImageMessage:
+    """foxglove_msgs/msg/CompressedVideo."""
+    cdr = _Cdr(data)
+    stamp_ns, frame = cdr.header()
+    blob = cdr.blob()
+    return ImageMessage(stamp_ns, frame, True, blob, encoding=cdr.text())
+
+
+def _packet_ros(data: bytes) -> ImageMessage:
+    """ffmpeg_image_transport_msgs/msg/FFMPEGPacket: after the encoding the encoder's time, flags, byte order."""
+    cdr = _Cdr(data)
+    stamp_ns, frame = cdr.header()
+    cdr.take("i", 2)
+    encoding = cdr.text()
+    cdr.take("Q"), cdr.take("B", 2)
+    return ImageMessage(stamp_ns, frame, True, cdr.blob(), encoding=encoding)
 
 
 def _camera_foxglove(data: bytes) -> CameraInfo:
@@ -261,8 +291,11 @@ def _joints_ros(data: bytes) -> WheelReading:
 IMAGES: dict[str, Callable[[bytes], ImageMessage]] = {
     "foxglove.RawImage": _image_foxglove_raw,
     "foxglove.CompressedImage": _image_foxglove_compressed,
+    "foxglove.CompressedVideo": _video_foxglove,
     "sensor_msgs/msg/Image": _image_ros_raw,
     "sensor_msgs/msg/CompressedImage": _image_ros_compressed,
+    "foxglove_msgs/msg/CompressedVideo": _video_ros,
+    "ffmpeg_image_transport_msgs/msg/FFMPEGPacket": _packet_ros,
 }
 CAMERAS: dict[str, Callable[[bytes], CameraInfo]] = {
     "foxglove.CameraCalibration": _camera_foxglove,

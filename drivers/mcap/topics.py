@@ -117,9 +117,6 @@ def is_rectified(topic: str) -> bool:
 def _content(topics: list[TopicInfo]) -> str:
     if not topics:
         return "no messages at all"
-    video = next((t.topic for t in topics if "Video" in t.schema), "")
-    if video:
-        return f"{video} is video, which is not supported: convert it to images first"
     return "its topics: " + ", ".join(f"{t.topic} {t.schema or t.encoding}" for t in topics[:12])
 
 

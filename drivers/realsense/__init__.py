@@ -49,6 +49,6 @@ def _find(probe: bool) -> Sequence[Attached]:
 # Intel's stereo cameras; a T265, which has another vendor or product, is not among them.
 _PRODUCTS = (0x0AD3, 0x0B07, 0x0B3A, 0x0B5C, 0x0B5B, 0x0AD1, 0x0AD2, 0x0AD4, 0x0AD5, 0x0B56)
 DRIVER = Driver(
-    "RealSense D400 and D500, over pyrealsense2, and files of its recorder", "SERIAL|FILE.bag", RealSenseOptions, _open,
+    "RealSense D400 and D500, over pyrealsense2, and files of its recorder", "SERIAL|FILE", RealSenseOptions, _open,
     cameras=Cameras("RealSense", _find, tuple(UsbId(0x8086, product) for product in _PRODUCTS)),
 )  # fmt: skip

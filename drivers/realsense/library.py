@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+import importlib.util
 from contextlib import suppress
 from typing import Any
 
@@ -82,7 +83,9 @@ def choose(found: dict[str, Any], wanted: str) -> str:
 
 
 def find_all() -> list[Attached]:
-    """All attached cameras."""
+    """All attached cameras; none without the library, which not everybody needs."""
+    if importlib.util.find_spec("pyrealsense2") is None:
+        return []
     rs = load()
     info = rs.camera_info
     return [

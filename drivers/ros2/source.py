@@ -56,6 +56,7 @@ WAITING_PAIRS = 8  # for the consumer: then the oldest is dropped
 WAITING_IMAGES = 8  # of one camera, for the other
 MAX_READINGS = 20_000
 STATIC_S = 1.0  # for the fixed transforms, after everything else is there
+STILLS = {kind: read for kind, read in IMAGES.items() if kind.startswith("sensor_msgs/")}  # lost messages spoil video
 NEEDS = "ROS 2 needs rclpy: source ROS's setup.bash in an environment with --system-site-packages"
 
 
@@ -158,7 +159,7 @@ class Ros2Source(BaseSource):
             self._await(self._image_topics)
             raise StereoSfmError(f"ros2: name the image topics: 'ros2:?left=TOPIC&right=TOPIC' ({self._there()})")
         for side, topic in enumerate(self._topics):
-            self._subscribe(topic, IMAGES, lambda p, side=side: self._pairs.put(side, p), qos_profile_sensor_data)
+            self._subscribe(topic, STILLS, lambda p, side=side: self._pairs.put(side, p), qos_profile_sensor_data)
         if self._options.imu:
             topics = self._options.imu.split(",")
             for k, topic in enumerate(topics[:2]):
@@ -224,7 +225,7 @@ class Ros2Source(BaseSource):
 
     def _image_topics(self) -> list[str]:
         rows = self._node.get_topic_names_and_types() if self._node is not None else []
-        return [topic for topic, kinds in rows if any(k in IMAGES for k in kinds)]
+        return [topic for topic, kinds in rows if any(k in STILLS for k in kinds)]
 
     def _await(self, found: Callable[[], Any]) -> Any:
         """What `found` finds within the patience, else what it found last."""

@@ -23,13 +23,15 @@ class VideoSource(BaseSource):
     def __init__(self, place: str, options: VideoOptions) -> None:
         """Raises StereoSfmError for a file that is no video, or whose size does not fit the calibration."""
         self._paths = [Path(text).expanduser() for text in (place, options.right) if text]
-        self.name = f"video:{self._paths[0].name}"
-        self.rig = chosen_rig(options.rig, self._no_rig)
-        self._fps, self._swap = options.fps, options.swap
+        self._prepare(f"video:{self._paths[0].name}", options)
         captures = [_opened(path) for path in self._paths]
         counts = [int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) for capture in captures]
         self.frame_count = min(counts) if min(counts) > 0 else None
         self._read(captures, 0)  # an error before the first frame
+
+    def _prepare(self, name: str, options: VideoOptions) -> None:
+        self.name, self._fps, self._swap = name, options.fps, options.swap
+        self.rig = chosen_rig(options.rig, self._no_rig)
 
     def _no_rig(self) -> Rig:
         raise StereoSfmError(f"{self.name} has no calibration: give one with --rig FILE")
@@ -42,16 +44,23 @@ class VideoSource(BaseSource):
 
     def _read(self, captures: list[cv2.VideoCapture], frame_id: int) -> StereoImage | None:
         """The next frame; None at the end."""
+        grabbed = [capture.grab() for capture in captures]  # all at once: cameras go on
+        if not all(grabbed):
+            return None
         found: list[U8] = []
         for capture in captures:
-            good, pixels = capture.read()
+            good, pixels = capture.retrieve()
             if not good:
                 return None
             grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
             found.append(grey.astype(np.uint8, copy=False))
-        stamp_ns = round(captures[0].get(cv2.CAP_PROP_POS_MSEC) * 1e6)  # of the frame that was read
+        stamp_ns = self._stamp_ns(captures[0], frame_id)
         left, right = self._sides(found)
-        return StereoImage(frame_id, round(frame_id * 1e9 / self._fps) if self._fps else stamp_ns, left, right)
+        return StereoImage(frame_id, stamp_ns, left, right)
+
+    def _stamp_ns(self, capture: cv2.VideoCapture, frame_id: int) -> int:
+        """Of the frame that was read."""
+        return round(frame_id * 1e9 / self._fps if self._fps else capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
 
     def _sides(self, found: list[U8]) -> tuple[U8, U8 | None]:
         """Left and right images of a frame (or of one of each file)."""

@@ -21,7 +21,7 @@ import numpy as np
 from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
-from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
 from stereo_sfm.dense.surface import Surface, extract
 from stereo_sfm.dense.volume import SIDE, Seen, contributes, cubes_of, fuse, touched
 from stereo_sfm.errors import StereoSfmError
@@ -32,7 +32,7 @@ from stereo_sfm.types import F64, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "1"  # of the files: grows when the same input gives other bits
+VERSION = "2"  # of the files: grows when the same input gives other bits
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
 Report = Callable[[str, int, int], None]  # what, done, of
 
@@ -136,11 +136,16 @@ def _depths(
 
     def tasks() -> Iterator[Any]:
         recent: deque[KeyframeImages] = deque(maxlen=16)  # more keyframes are too far away
+        last: KeyframeImages | None = None  # with depth
         for now in keyframes(given):
             if recent and sessions[recent[-1].number] != sessions[now.number]:
                 recent.clear()
-            place = floor_T_map @ now.map_T_cam
-            yield now, earlier(recent, now), folder, voxel, place, int(sessions[now.number])
+                last = None
+            if last is None or shows_more(last, now):
+                last, place = now, floor_T_map @ now.map_T_cam
+                yield now, earlier(recent, now), folder, voxel, place, int(sessions[now.number])
+            else:
+                yield None
             recent.append(now)
 
     kept: list[KeptDepth] = []
@@ -151,6 +156,8 @@ def _depths(
 
 
 def _depth(task: Any) -> KeptDepth | None:
+    if task is None:  # a keyframe that shows what another showed
+        return None
     now, before, folder, voxel, floor_T_cam, session = task
     path, key = folder / f"{now.number:06d}.npz", _depth_key(now, before)
     found = _read_depth(path, key)
@@ -160,7 +167,7 @@ def _depth(task: Any) -> KeptDepth | None:
             return None
         _write(path, key, _depth_columns(found))
     seen = Seen(found, floor_T_cam, session)
-    return KeptDepth(path, key, floor_T_cam, session, seen.reach, tuple(sorted(touched(seen, voxel))))
+    return KeptDepth(path, key, floor_T_cam, session, seen.reach(voxel), tuple(sorted(touched(seen, voxel))))
 
 
 def _depth_key(now: KeyframeImages, before: KeyframeImages | None) -> str:

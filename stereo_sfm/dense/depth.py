@@ -29,27 +29,30 @@ class DepthImage(ReadOnly):
         return ((self.camera.bearing_grid() @ self.cam_R_view.T) * self.ranges[..., None]).astype(np.float32)
 
 
-def disparities(left: U8, right: U8, count: int, both: bool = True) -> tuple[F32, F32]:
+def disparities(left: U8, right: U8, count: int, step: int = 1) -> tuple[F32, F32]:
     """(H, W) px disparities of a rectified pair and their standard deviations, NaN where unknown.
 
     Args:
         left, right: (H, W). count: largest disparity plus one, a multiple of 16.
-        both: refine the right image's disparities as well, and keep what agrees: fewer gross errors, twice the time.
+        step: px between the pixels that get a disparity. With 1 the right image's are refined as well, and what agrees
+            is kept: fewer gross errors. More is faster by twice its square; other keyframes then tell gross errors.
     """
     start, back = match_both_ways(left, right, count)
-    found, predicted = refine(left, right, start)
-    if both:
+    found, predicted = refine(left, right, start, step)
+    if step == 1:
         swapped = [np.ascontiguousarray(image[:, ::-1]) for image in (right, left)]
         other = refine(swapped[0], swapped[1], np.ascontiguousarray(back[:, ::-1]))[0]
         other = np.ascontiguousarray(other[:, ::-1])
         found = agreeing(found, other, AGREE_PX)
     predicted = np.where(np.isfinite(found), predicted, np.nan).astype(np.float32)
-    return found, learned_sigmas(found, predicted)
+    return found, learned_sigmas(found, predicted, step)
 
 
-def pair_depth(view: PairView, left: U8, right: U8, both: bool = True) -> DepthImage:
-    """Depth of a pair of images of the view's cameras."""
+def pair_depth(view: PairView, left: U8, right: U8, step: int = 1) -> DepthImage:
+    """Depth of a pair of images of the view's cameras, at every `step`-th pixel of its rows and columns."""
     a, b = view.images(left, right)
-    disparity, sigma = disparities(a, b, view.disparities, both)
-    disparity[~view.first.mask] = np.nan
-    return DepthImage(view.camera, view.cam_R_view, view.ranges(disparity), view.range_sigmas(disparity, sigma), a)
+    disparity, sigma = disparities(a, b, view.disparities, step)
+    disparity[~view.first.mask[::step, ::step]] = np.nan
+    coarse, disparity, sigma = view.every(step), disparity / np.float32(step), sigma / np.float32(step)
+    ranges, sigmas = coarse.ranges(disparity), coarse.range_sigmas(disparity, sigma)
+    return DepthImage(coarse.camera, view.cam_R_view, ranges, sigmas, np.ascontiguousarray(a[::step, ::step]))

@@ -14,6 +14,7 @@ from stereo_sfm.dense.surface import joined
 from stereo_sfm.dense.volume import SIDE
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, write_floor_plan
 from stereo_sfm.export.ply import write_ply
+from stereo_sfm.maps.floor import HIGH
 from stereo_sfm.types import F32, F64, I64, U8
 
 
@@ -104,9 +105,10 @@ def costmap(results: list[CubeResult], voxel: float, map_T_floor: F64) -> FloorP
 
 
 def write_heights(path: Path, points: F64, voxel: float) -> None:
-    """The surface from above, coloured by height."""
+    """The surface below `HIGH` from above, coloured by height: a ceiling would hide all."""
     import cv2
 
+    points = points[points[:, 2] < HIGH]
     if not len(points):
         return
     low = points[:, :2].min(axis=0)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.dense.depth import DepthImage, pair_depth
-from stereo_sfm.dense.views import motion_view, stereo_view
+from stereo_sfm.dense.views import PairView, motion_view, stereo_view
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F32, F64, U8
@@ -20,7 +21,9 @@ MOTION_M = (
 )  # between keyframes that are matched: less is a pair's own baseline, with more, views differ
 BEST_M = 0.3
 VIEW_PX = 640  # longest side of a view: finer ones cost more than a voxel of 2 cm shows
+STEP = 2  # px of a view between depths: a voxel of 2 cm at 2.5 m and 200 px a radian
 AGREE_SIGMAS = 3.0
+SPACING_M, SPACING_DEG = 0.25, 15.0  # between keyframes with depth: a shelf 1 m away is still seen by several
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,23 +44,35 @@ def earlier(keyframes: Sequence[KeyframeImages], now: KeyframeImages) -> Keyfram
     return keyframes[min(good, key=lambda i: abs(apart[i] - BEST_M))] if good else None
 
 
+def shows_more(last: KeyframeImages, now: KeyframeImages) -> bool:
+    """Whether the camera moved or turned enough since `last` for a depth image of its own."""
+    moved = se3.inverse(last.map_T_cam) @ now.map_T_cam
+    turned = 0.5 * (np.trace(moved[:3, :3]) - 1) < np.cos(np.deg2rad(SPACING_DEG))
+    return bool(turned or np.linalg.norm(moved[:3, 3]) >= SPACING_M)
+
+
 def keyframe_depth(now: KeyframeImages, before: KeyframeImages | None) -> DepthImage | None:
     """Depth of a keyframe's left camera; None where there is one camera and no motion.
 
-    The right images' disparities are not refined: it would take twice the time, and other keyframes tell gross errors.
+    Every `STEP`-th pixel is refined, of the left images alone: other keyframes tell gross errors.
     """
     rig, pair = now.rig, None
     scale = min(1.0, VIEW_PX / max(rig.left.size))
     if rig.second_camera is not None and now.right is not None:
-        pair = pair_depth(stereo_view(rig, scale), now.left, now.right, both=False)
+        pair = pair_depth(_pair_view(rig, scale), now.left, now.right, STEP)
     if before is None:
         return pair
     now_T_before = se3.inverse(now.map_T_cam) @ before.map_T_cam
     view = motion_view(rig.left, before.rig.left, now_T_before, scale * rig.left.fx)
     if view is None:
         return pair
-    moved = pair_depth(view, now.left, before.left, both=False)
+    moved = pair_depth(view, now.left, before.left, STEP)
     return moved if pair is None else joined(pair, moved)
+
+
+@lru_cache(4)
+def _pair_view(rig: Rig, scale: float) -> PairView:
+    return stereo_view(rig, scale)
 
 
 def joined(first: DepthImage, second: DepthImage) -> DepthImage:

@@ -21,9 +21,12 @@ ONE_SIGMA = 0.6827  # share within one standard deviation
 UNLEARNED = 2.0  # over the predicted noise, where nothing can be learned
 
 
-def learned_sigmas(disparity: F32, predicted: F32) -> F32:
-    """(H, W) px standard deviations of disparities (H, W), from those (H, W) that grey-level noise predicts."""
-    apart, noise = _second_differences(disparity, predicted)
+def learned_sigmas(disparity: F32, predicted: F32, step: int = 1) -> F32:
+    """(H, W) px standard deviations of disparities (H, W), from those (H, W) that grey-level noise predicts.
+
+    `step`: px of the image between two of these disparities.
+    """
+    apart, noise = _second_differences(disparity, predicted, -(-APART // step))
     if len(apart) < BINS * FEW:
         return (UNLEARNED * predicted).astype(np.float32)
     order = np.argsort(noise, kind="stable")
@@ -33,15 +36,15 @@ def learned_sigmas(disparity: F32, predicted: F32) -> F32:
     return np.interp(predicted, x, y).astype(np.float32)  # keeps NaN
 
 
-def _second_differences(disparity: F32, predicted: F32) -> tuple[F32, F32]:
+def _second_differences(disparity: F32, predicted: F32, away: int) -> tuple[F32, F32]:
     """Absolute second differences over the root of six, along rows and columns, and their predicted noise."""
     found: list[F32] = []
     noise: list[F32] = []
     for axis in (0, 1):
         n = disparity.shape[axis]
-        if n <= 2 * APART:
+        if n <= 2 * away:
             continue
-        low, mid, high = (range(i, n - 2 * APART + i) for i in (0, APART, 2 * APART))
+        low, mid, high = (range(i, n - 2 * away + i) for i in (0, away, 2 * away))
         a, b, c = (disparity.take(part, axis) for part in (low, mid, high))
         sa, sb, sc = (predicted.take(part, axis) for part in (low, mid, high))
         one = (np.abs(a - b) <= SAME_SURFACE) & (np.abs(c - b) <= SAME_SURFACE)

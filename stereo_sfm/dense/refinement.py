@@ -30,12 +30,13 @@ MATCH_PX = 1.5  # px, standard deviation of the matcher's disparity: holds windo
 GREY_NOISE = 1.0  # grey levels, of a camera's pixel after rounding and resampling
 
 
-def refine(left: U8, right: U8, disparity: F32) -> tuple[F32, F32]:
+def refine(left: U8, right: U8, disparity: F32, step: int = 1) -> tuple[F32, F32]:
     """Refined (H, W) px disparities, and the standard deviations (H, W) px that grey-level noise alone would give.
 
     Args:
         left, right: (H, W) rectified images.
         disparity: (H, W) px from matching, NaN where unknown.
+        step: px between the pixels that are refined, along rows and columns; the results are smaller by it.
 
     Returns:
         NaN where a window has no texture along the row or drifts away.
@@ -43,7 +44,7 @@ def refine(left: U8, right: U8, disparity: F32) -> tuple[F32, F32]:
     offset = np.arange(-RADIUS, RADIUS + 1)
     near = np.exp(-(offset[:, None] ** 2 + offset[None, :] ** 2) / (2 * SPREAD**2)).ravel()
     like = np.exp(-np.arange(256) / LIKENESS)
-    return _refine(left, right, disparity, near, like)
+    return _refine(left, right, disparity, near, like, step)
 
 
 @inner
@@ -73,15 +74,17 @@ def _slopes(disparity, u, v):
 
 
 @njit
-def _refine(left, right, disparity, near, like):
+def _refine(left, right, disparity, near, like, step):
     h, w = left.shape
-    out, sigma = np.full((h, w), np.nan, np.float32), np.full((h, w), np.nan, np.float32)
+    rows_out, columns_out = (h + step - 1) // step, (w + step - 1) // step
+    out = np.full((rows_out, columns_out), np.nan, np.float32)
+    sigma = out.copy()
     size = (2 * RADIUS + 1) ** 2
     weight, grey, rows, shift = np.empty(size), np.empty(size), np.empty(size, np.int64), np.empty(size)
     other, slope = np.empty(size), np.empty(size)
     held = (GREY_NOISE / MATCH_PX) ** 2
-    for v in range(RADIUS, h - RADIUS):
-        for u in range(RADIUS, w - RADIUS):
+    for v in range(-(-RADIUS // step) * step, h - RADIUS, step):
+        for u in range(-(-RADIUS // step) * step, w - RADIUS, step):
             start = disparity[v, u]
             if math.isnan(start):
                 continue
@@ -132,15 +135,15 @@ def _refine(left, right, disparity, near, like):
                     spread += wg * wg
                 if gain < LEAST_GRADIENT * LEAST_GRADIENT * total:
                     break
-                step = min(max(-pull / (gain + held * total), -0.5), 0.5)
-                found += step
+                change = min(max(-pull / (gain + held * total), -0.5), 0.5)
+                found += change
                 if abs(found - start) > FARTHEST:
                     break
                 squares /= total
                 done = True
-                if abs(step) < 0.01:
+                if abs(change) < 0.01:
                     break
             if done and gain >= LEAST_GRADIENT * LEAST_GRADIENT * total and abs(found - start) <= FARTHEST:
-                out[v, u] = found
-                sigma[v, u] = math.sqrt((squares + GREY_NOISE * GREY_NOISE) * spread) / gain
+                out[v // step, u // step] = found
+                sigma[v // step, u // step] = math.sqrt((squares + GREY_NOISE * GREY_NOISE) * spread) / gain
     return out, sigma

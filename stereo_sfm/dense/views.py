@@ -8,7 +8,7 @@ holds in the whole view, so that one image shows what is ahead and the shelves o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -57,6 +57,12 @@ class PairView:
         """Largest disparity plus one that is searched, px: a multiple of 16, as the matcher needs."""
         most = self.camera.fx * 2 * np.arctan(0.5 * self.baseline / self.nearest) + 1
         return max(16, -(-int(most) // 16) * 16)
+
+    def every(self, step: int) -> PairView:
+        """The view of every `step`-th pixel alone; its disparities are smaller by `step`."""
+        c = self.camera
+        size = -(-c.width // step), -(-c.height // step)
+        return replace(self, camera=type(c)(*size, c.fx / step, c.fy / step, c.cx / step, c.cy / step))
 
     def images(self, first: U8, second: U8) -> tuple[U8, U8]:
         """Both (H, W) images in the view."""

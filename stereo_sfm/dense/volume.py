@@ -20,7 +20,7 @@ import numpy as np
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit, project_one
-from stereo_sfm.types import F32, F64, I64, ReadOnly
+from stereo_sfm.types import F32, F64, I64, Bool, ReadOnly
 
 SIDE = 64  # voxels
 APRON = 1  # voxels around a cube, from which its surface at the border follows
@@ -38,10 +38,13 @@ class Seen(ReadOnly):
     floor_T_cam: F64  # (4, 4)
     session: int
 
-    @property
-    def reach(self) -> float:
-        """Largest range in metres."""
-        return float(np.nanmax(self.depth.ranges, initial=0.0))
+    def used(self, voxel: float) -> Bool:
+        """(H, W) pixels whose range is known well enough to say where in the field a surface is."""
+        return self.depth.sigmas <= TRUNCATION * voxel
+
+    def reach(self, voxel: float) -> float:
+        """Largest range in metres that is used."""
+        return float(np.max(self.depth.ranges[self.used(voxel)], initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,7 @@ class Cube(ReadOnly):
 
 def touched(seen: Seen, voxel: float) -> set[tuple[int, int, int]]:
     """The cubes in which a depth image has surfaces."""
-    points = seen.depth.points()[np.isfinite(seen.depth.ranges)].astype(np.float64)
+    points = seen.depth.points()[seen.used(voxel)].astype(np.float64)
     at = np.floor(se3.transform(seen.floor_T_cam, points) / (SIDE * voxel)).astype(np.int64)
     return {(int(x), int(y), int(z)) for x, y, z in np.unique(at, axis=0)}
 
@@ -129,6 +132,8 @@ def _integrate(distance, weight, views, grey, ranges, sigmas, image, coarse, mod
                 if away > radius and 1.5 * params[0] * radius < TILE * (away - radius):
                     found = project_one(model, params, px, py, pz)
                     u, v = found[0], found[1]
+                    if not (-TILE <= u < w + TILE and -TILE <= v < h + TILE):
+                        continue  # outside the view, as the block is smaller than a tile there
                     if 0 <= u < w and 0 <= v < h and away - radius > coarse[int(v) // TILE, int(u) // TILE] + cut:
                         continue  # behind everything around, or nothing was measured
                 for i in range(bx, bx + BLOCK):

@@ -275,7 +275,8 @@ def _against_calibration(source: Source) -> list[str]:
         return [str(error)]
     if not found.text:
         return []
-    return [found.text if found.rig is None else f"{found.text}: a run corrects it at its start; {found.advice}"]
+    done = "corrects" if found.rig is not None else "masks" if found.masked is not None else ""
+    return [f"{found.text}: a run {done} it at its start; {found.advice}" if done else found.text]
 
 
 def _shows_nothing(image: StereoImage) -> str:

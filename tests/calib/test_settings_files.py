@@ -103,6 +103,19 @@ def test_orbslam2_rectified_and_depth(tmp_path: Path) -> None:
         of_text(tmp_path, depth.replace("DepthMapFactor", "Other"), size=(640, 480))
 
 
+@pytest.mark.parametrize("model", ["radial_division", "equirectangular"])
+def test_lenses_that_we_have_not_are_refused(model: str, tmp_path: Path) -> None:
+    """Also where the file lacks the focal length, which an equirectangular image has not."""
+    stella = STELLA.replace('"perspective"', f'"{model}"')
+    for text in (stella, f"Camera:\n  name: x\n  model: {model}\n  cols: 64\n  rows: 32\n"):
+        with pytest.raises(StereoSfmError, match=f"camera model '{model}' is not supported .*perspective, fisheye"):
+            of_text(tmp_path, text)
+    orbslam = orbslam2_euroc().split("LEFT")[0] + f'Camera.type: "{model}"\n'
+    with pytest.raises(StereoSfmError, match=f"camera type '{model}' is not supported .*pinhole, rectified") as refused:
+        of_text(tmp_path, orbslam)
+    assert "\n" not in str(refused.value)
+
+
 @pytest.mark.parametrize("old", [False, True])
 def test_orbslam3_fisheye_pair_with_imu(tmp_path: Path, old: bool) -> None:
     first, pose, body = ("Camera", "Tlr", "Tbc") if old else ("Camera1", "Stereo.T_c1_c2", "IMU.T_b_c1")

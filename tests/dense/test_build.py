@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,8 +19,11 @@ import yaml
 
 from stereo_sfm.cli import main
 from stereo_sfm.dense import build as module
-from stereo_sfm.dense.files import write_all
-from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth
+from stereo_sfm.dense import inputs
+from stereo_sfm.dense.files import write_all, write_heights
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from tests.dense.test_depth import render
 from tests.maps.maps import small_map
 from tests.synthetic import pinhole_rig
@@ -73,6 +79,7 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     numbers = write_all(results, tmp_path, VOXEL, map_T_floor)
     made = case.made
     assert made == len(results) > 1
+    assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["000000.npz", "000002.npz"], "15 cm show no more"
     written = {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
 
     (tmp_path / "cubes" / sorted(p.name for p in (tmp_path / "cubes").iterdir())[0]).write_bytes(b"cut off")
@@ -102,6 +109,30 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     assert image[row + 12, column] == 254, "the floor before it is free"
 
 
+def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
+    x, y = (a.ravel() * 0.1 for a in np.mgrid[:10, :10])
+    below = np.stack([x, y, np.where(x < 0.5, 0.0, 1.5)], axis=1)
+    ceiling = np.stack([x, y, np.full(100, 2.8)], axis=1)
+    pictures: list[Any] = []
+    for points in (below, np.concatenate([below, ceiling])):
+        write_heights(tmp_path / "height.png", points, 0.1)
+        pictures.append(cv2.imread(str(tmp_path / "height.png")))
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+
+
+@pytest.mark.slow  # starts two processes
+def test_two_processes_write_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(monkeypatch)
+    case.frames = case.frames[::2]
+    for jobs in (1, 2):
+        folder = tmp_path / str(jobs)
+        results, map_T_floor = module.build(case.given, folder, 0.08, jobs)
+        write_all(results, folder, 0.08, map_T_floor)
+    one, two = ({p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*.*")} for n in "12")
+    assert len(one) > 8
+    assert one == two
+
+
 def reversed_args(built: Any, folder: Path) -> tuple[Any, ...]:
     return built[0], folder, VOXEL, built[1]
 
@@ -118,6 +149,65 @@ def test_one_camera_has_depth_from_motion_alone() -> None:
     assert len(sides) > 300
     off = np.minimum(np.abs(sides[:, 0] + 1.0), np.abs(sides[:, 0] - 1.1))
     assert np.median(off) < 0.02
+
+
+def test_depth_only_where_the_camera_moved_or_turned() -> None:
+    frames = drive(3, right=False)
+    assert not shows_more(frames[0], frames[1])
+    assert shows_more(frames[0], frames[2])
+    for degrees, more in ((10.0, False), (20.0, True)):
+        turned = frames[0].map_T_cam @ se3.exp(np.array([0, 0, 0, 0, np.deg2rad(degrees), 0]))
+        assert shows_more(frames[0], replace(frames[0], map_T_cam=turned)) == more
+
+
+def test_a_full_disk_is_one_line_and_what_was_fused_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = Case(monkeypatch)
+    made: list[str] = []
+    save = np.savez_compressed
+
+    def full(file: Any, **columns: Any) -> None:
+        if len(made) >= 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        made.append(file.name)
+        save(file, **columns)
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr("stereo_sfm.dense.inputs.find_input", lambda *_: case.given)
+    out = tmp_path / "out"
+    assert main(["dense", "any", "-o", str(out), "--voxel", "0.08", "--jobs", "1", "-q"]) == 2
+    err = capsys.readouterr().err.strip()
+    assert len(err.splitlines()) == 1
+    assert f"cannot write to {out}: No space left on device; what was written so far is kept" in err
+    kept = sorted((out / "depth").iterdir()) + sorted((out / "cubes").iterdir())
+    assert len(kept) == 2
+    for path in kept:
+        with np.load(path) as data:
+            assert all(data[name] is not None for name in data.files)
+
+
+def test_a_run_without_images_says_which_log_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"")
+    monkeypatch.setattr(inputs, "LogReader", lambda _: nullcontext())
+    for source in ("euroc:/gone/away", ""):
+        monkeypatch.setattr(inputs, "read_run", lambda _, s=source: SimpleNamespace(image_format="none", source=s))
+        monkeypatch.setattr(inputs, "load_map", lambda _: None)
+        with pytest.raises(StereoSfmError, match="run again with --log full, or name the recording") as caught:
+            inputs.find_input(tmp_path)
+        assert (source or "(unnamed)") in str(caught.value)
+
+
+def test_a_keyframe_without_image_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    saved = small_map()[1]
+    images = [
+        SimpleNamespace(frame_id=k, stamp_ns=t, left=None, right=None)
+        for k, t in zip(saved.snapshot.frame_ids.tolist(), saved.snapshot.stamp_ns.tolist(), strict=True)
+    ]
+    monkeypatch.setattr(inputs, "open_recording", lambda *_: nullcontext(images[:-2]))
+    given = inputs.DenseInput(saved, ("walk.mcap",), None)
+    with pytest.raises(StereoSfmError, match=r"walk\.mcap lacks 2 of the map's keyframes"):
+        list(inputs.keyframes(given))
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,6 +9,7 @@ import pytest
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.dense.depth import disparities, pair_depth
 from stereo_sfm.dense.matching import match_both_ways
+from stereo_sfm.dense.refinement import refine
 from stereo_sfm.dense.views import PairView, motion_view, stereo_view
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
@@ -93,3 +94,21 @@ def test_disparities_are_finer_than_the_matchers_and_know_how_fine() -> None:
 def test_nothing_is_found_where_there_is_no_texture() -> None:
     flat = np.full((100, 160), 90, np.uint8)
     assert not np.isfinite(disparities(flat, flat, 16)[0]).any()
+
+
+def test_a_coarser_grid_has_the_same_disparities_at_its_pixels() -> None:
+    big = texture()
+    left, right = np.ascontiguousarray(big[100:143, 100:181]), np.ascontiguousarray(big[100:143, 105:186])
+    start = np.full(left.shape, 5.2, np.float32)
+    fine, coarse = (refine(left, right, start, step) for step in (1, 2))
+    assert np.isfinite(coarse[0]).sum() > 300
+    for whole, part in zip(fine, coarse, strict=True):
+        np.testing.assert_array_equal(whole[::2, ::2], part)
+
+
+def test_a_view_of_every_second_pixel_has_the_same_ranges() -> None:
+    for rig in (pinhole_rig(), fisheye_rig()):
+        view = stereo_view(rig, 0.3)
+        disparity = np.full((view.camera.height, view.camera.width), 4.0, np.float32)
+        coarse = view.every(2).ranges(np.asarray(disparity[::2, ::2] / 2, np.float32))
+        np.testing.assert_allclose(coarse, view.ranges(disparity)[::2, ::2], rtol=1e-5)

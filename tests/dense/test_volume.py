@@ -27,7 +27,7 @@ def wall(z: float, session: int = 0, place: F64 | None = None, sigma: float = 0.
 
 def mesh(images: list[Seen]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     cubes = cubes_of([touched(s, VOXEL) for s in images])
-    kept = [[s for s in images if contributes(s.floor_T_cam[:3, 3], s.reach, c, VOXEL)] for c in cubes]
+    kept = [[s for s in images if contributes(s.floor_T_cam[:3, 3], s.reach(VOXEL), c, VOXEL)] for c in cubes]
     return joined([extract(fuse(c, k, VOXEL)) for c, k in zip(cubes, kept, strict=True)])
 
 
@@ -76,3 +76,10 @@ def test_depths_join_by_their_variances_and_contradictions_are_left_out() -> Non
     assert 2.015 < np.nanmedian(both.ranges) < 2.03
     assert np.nanmedian(both.sigmas) < 0.01
     assert not np.isfinite(joined_depth(flat(2.0, 0.02), flat(2.5, 0.02)).ranges).any()
+
+
+def test_ranges_that_are_hardly_known_reach_nowhere() -> None:
+    """A disparity near zero says kilometres; no cube may come of it."""
+    far = wall(2000.0, sigma=500.0)
+    assert touched(far, VOXEL) == set()
+    assert far.reach(VOXEL) == 0

@@ -50,6 +50,18 @@ def test_kitti_root_and_sequence_folder_are_one_source(tmp_path: Path) -> None:
             assert source.ground_truth.positions[:, 2].tolist() == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize("make", [make_kitti, make_kitti_raw])
+def test_kitti_as_jpeg(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    root = make(tmp_path)
+    for path in root.rglob("*.png"):
+        cv2.imwrite(str(path.with_suffix(".jpg")), cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        path.unlink()
+    with open_source(root) as source:
+        images = list(source)
+    assert source.name.startswith("kitti") and len(images) == FRAMES and all(i.right is not None for i in images)
+    assert np.abs(images[2].left.astype(int) - picture(2, 0)).mean() < 15
+
+
 def test_several_kitti_sequences_must_be_chosen_from(tmp_path: Path) -> None:
     root = make_kitti(tmp_path)
     (root / "sequences" / "07" / "image_0").mkdir(parents=True)

@@ -96,7 +96,7 @@ def test_commands(oak: FakeOak, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     assert json.loads(capsys.readouterr().out)["devices"][0]["firmware"] == "0.2.0.951"
     monkeypatch.setattr("stereo_sfm.drivers.t265.usb_device.default_backend", lambda: SimulatedBus([]))
     assert cli.main(["devices"]) == 0
-    assert "no OAK or T265 attached" in capsys.readouterr().out
+    assert "no OAK or RealSense or T265 attached" in capsys.readouterr().out
     assert cli.main(["t265", "reset"]) == 2
     assert "no T265 attached" in capsys.readouterr().err
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import struct
 from collections.abc import Callable, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +25,15 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.choice import SourceChoice
+from stereo_sfm.drivers.mcap.foreign import ForeignSource
+from stereo_sfm.drivers.mcap.messages import IMAGES
 from stereo_sfm.drivers.mcap.topics import choose_topics
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.log import foxglove, topics
+from stereo_sfm.log.images import UnknownEncoding
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.types import U8
 from tests.log.recordings import fisheye_rig, stereo_images, write_recording
@@ -347,11 +352,6 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
     nothing = _write(tmp_path / "nothing.mcap", [], [], transforms=())
     assert "no messages at all" in _error(nothing, capsys)
 
-    def video(i: int, side: int, frame: str) -> CompressedVideo:
-        return CompressedVideo(frame_id=frame, format="h264", data=b"x")
-
-    assert "is video, which is not supported" in _error(_write(tmp_path / "video.mcap", image=video), capsys)
-
 
 def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def uncalibrated(side: int, message: CameraCalibration) -> None:
@@ -581,11 +581,95 @@ def test_images_that_are_too_short_are_refused_once(tmp_path: Path, capsys: pyte
     assert capsys.readouterr().out.count("bayer_rggb16") == 1
 
 
-def test_compressed_images_that_are_video_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def image(i: int, side: int, frame: str) -> CompressedImage:
-        return CompressedImage(frame_id=frame, data=b"\0\0\0\1", format="h264")
+def _video(codec: str, side: int, count: int = 10) -> list[bytes]:
+    """A message of each image of a film, every fourth a keyframe."""
+    av: Any = pytest.importorskip("av")
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.time_base = W, H, "yuv420p", Fraction(1, 20)
+    encoder.options = {"tune": "zerolatency", "g": "4", "crf": "1", "x265-params": "keyint=4:log-level=none"}
+    frames = [av.VideoFrame.from_ndarray(np.pad(_scene(i, side), ((0, H // 2), (0, 0)), constant_values=128), "yuv420p")
+              for i in range(count)]  # fmt: skip
+    packets = [bytes(packet) for frame in [*frames, None] for packet in encoder.encode(frame)]
+    assert len(packets) == count
+    return packets
 
-    assert "'h264' images are video" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
+
+def _scene(i: int, side: int) -> U8:
+    y, x = np.mgrid[:H, :W]
+    return (120 + 60 * np.sin((x + 3 * i + 9 * side) / 6) * np.cos(y / 5)).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("codec", "message", "name"),
+    [
+        ("libx264", CompressedVideo, "h264"),
+        ("libx265", CompressedVideo, "h265"),
+        ("libx264", CompressedImage, "h264"),
+    ],
+)
+def test_topics_of_video_are_decoded(codec: str, message: type[Any], name: str, tmp_path: Path) -> None:
+    """From any start on, also between two keyframes, the same pixels."""
+    films = [_video(codec, side) for side in (0, 1)]
+
+    def image(i: int, side: int, frame: str) -> Any:
+        return message(frame_id=frame, format=name, data=films[side][i])
+
+    with open_source(_write(tmp_path / "a.mcap", image=image, count=10)) as source:
+        whole = list(source)
+        assert isinstance(source, ForeignSource)
+        part = list(source.frames(start_ns=10**9 + 6 * PERIOD_NS))
+    assert [image.stamp_ns for image in whole] == [10**9 + i * PERIOD_NS for i in range(10)]
+    for i, found in enumerate(whole):
+        assert found.right is not None
+        for side, pixels in enumerate((found.left, found.right)):
+            assert np.abs(pixels.astype(int) - _scene(i, side)).mean() < 2
+    assert [image.stamp_ns for image in part] == [image.stamp_ns for image in whole[6:]]
+    for a, b in zip(part, whole[6:], strict=True):
+        np.testing.assert_array_equal(a.left, b.left)
+
+
+def test_a_video_that_begins_between_keyframes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its images are those from the first keyframe on; without one it is refused."""
+    films = [_video("libx264", side) for side in (0, 1)]
+
+    def image(i: int, side: int, frame: str) -> CompressedVideo:
+        return CompressedVideo(frame_id=frame, format="h264", data=films[side][i + 1])
+
+    with open_source(_write(tmp_path / "a.mcap", image=image, count=9)) as source:
+        assert [image.stamp_ns for image in source] == [10**9 + i * PERIOD_NS for i in range(3, 9)]
+    path = _write(tmp_path / "b.mcap", image=image, count=3)
+    assert "its images cannot be read: 'h264' video without a keyframe" in _error(path, capsys)
+    assert main(["info", str(path)]) == 0
+    assert capsys.readouterr().out.count("video without a keyframe") == 1
+
+
+def test_video_needs_its_extra(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def image(i: int, side: int, frame: str) -> CompressedVideo:
+        return CompressedVideo(frame_id=frame, format="h264", data=b"x")
+
+    def without(name: str) -> None:
+        """No library is found."""
+
+    monkeypatch.setattr("importlib.util.find_spec", without)
+    assert "needs av: pip install 'stereo-sfm[video]'" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
+
+
+def test_video_messages_of_ros() -> None:
+    """Laid out as CDR by hand: header, then the fields of either definition."""
+    header = b"\0\1\0\0" + struct.pack("<iII", 3, 7, 4) + b"cam\0"
+    video = header + struct.pack("<I4sI5s", 4, b"data", 5, b"h265\0")
+    packet = header + struct.pack("<iiI8sxxxxQBBxxI4s", 64, 48, 8, b"libx264\0", 9, 1, 0, 4, b"data")
+    for kind, data, decoder in (
+        ("foxglove_msgs/msg/CompressedVideo", video, "hevc"),
+        ("ffmpeg_image_transport_msgs/msg/FFMPEGPacket", packet, "h264"),
+    ):
+        message = IMAGES[kind](data)
+        assert (message.stamp_ns, message.frame, message.data) == (3 * 10**9 + 7, "cam", b"data")
+        assert message.video == decoder
+        with pytest.raises(UnknownEncoding, match="is video, which is read from recordings only"):
+            message.gray()
 
 
 @pytest.mark.parametrize(("encoding", "height", "depth"), [("nv12", 3 * H // 2, 1), ("bayer_rggb16", H, 2)])

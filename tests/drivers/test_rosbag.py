@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,20 @@ def test_a_bag_gives_what_was_written(kind: str, packed: bool, tmp_path: Path) -
         both = [np.concatenate([getattr(i.imu, name) for i in some]) for some in (read, images)]
         np.testing.assert_array_equal(both[0], both[1][: len(both[0])])
         assert len(both[0]) >= len(both[1]) - 1  # a sample later than the last image has no image
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[2]])
+def test_a_folder_without_metadata(kind: str, tmp_path: Path) -> None:
+    """As a recorder leaves it that was killed: its only file is read; of several none is chosen."""
+    source, images = _simulated()
+    folder = write_bag(tmp_path, kind, source.rig, images)
+    (folder / "metadata.yaml").unlink()
+    with open_source(folder) as bag:
+        assert [image.stamp_ns for image in bag] == [image.stamp_ns for image in images]
+    only = next(folder.iterdir())
+    shutil.copy(only, only.with_name(f"second{only.suffix}"))
+    with pytest.raises(StereoSfmError, match=r"2 files and no metadata\.yaml: 'ros2 bag reindex"):
+        open_source(folder)
 
 
 @pytest.mark.parametrize(

@@ -144,6 +144,16 @@ def in_group(tracks: Tracks, points: Bool) -> Bool:
     return out
 
 
+def beside_moving(tracks: Tracks) -> Bool:
+    """(N,) which static points have a moving one among their nearest neighbours, at about their distance."""
+    out = np.zeros(len(tracks), bool)
+    if not tracks.moving.any():
+        return out
+    rows = np.flatnonzero(~tracks.moving)
+    out[rows] = _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, tracks.moving) > 0
+    return out
+
+
 def without_moving(corners: Corners, tracks: Tracks, movers: Movers) -> Corners:
     """The corners that are not on moving objects."""
     distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)

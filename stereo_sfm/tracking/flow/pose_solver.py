@@ -317,6 +317,98 @@ def errors_at(pose, velocity, points, cameras, sigma):
 
 
 @njit
+def influence(pose, velocity, covariance, points, cameras, sigma, scale):
+    """What points say about a pose beside its covariance (6, 6), whether it was solved from them or from others.
+
+    A point on which much of a pose rests has a small error there whatever it shows. At a pose by the others it has not
+    (Cook & Weisberg, Residuals and Influence in Regression, 1982, section 2.2, leverage and deleted residuals).
+    Arguments as of `optimise_pose`, the last Cauchy scale.
+
+    Returns:
+        (N,) degrees of freedom of the pose that rest on each point if it was solved from them: of all points 6.
+        (N,) errors, whitened by the noise of the point and of the pose if it was solved from others; inf for points
+        that are not visible.
+    """
+    rho, variance = points.rho, points.variance
+    res, jac, ray, seen = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros((4, 4))
+    row, step = pose.copy(), np.zeros((4, 4))
+    freedoms, errors = np.zeros(len(rho)), np.full(len(rho), np.inf)
+    spread, left, factor, white = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4)
+    for k in range(len(rho)):
+        rows = _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray)
+        if rows == 0:
+            continue
+        for i in range(rows, 4):
+            res[i], ray[i], jac[i] = 0.0, 0.0, 0.0
+        for a in range(4):
+            for b in range(4):
+                seen[a, b] = 0.0  # of the pose's covariance in rows a and b
+                for i in range(6):
+                    for j in range(6):
+                        seen[a, b] += jac[a, i] * covariance[i, j] * jac[b, j]
+                spread[a, b] = variance[k] * ray[a] * ray[b] + (sigma * sigma if a == b else 0.0)
+        invert_symmetric(spread, left, factor)
+        chi2 = 0.0
+        for a in range(4):
+            for b in range(4):
+                chi2 += left[a, b] * res[a] * res[b]
+                freedoms[k] += left[a, b] * seen[a, b]
+                spread[a, b] += seen[a, b]
+        freedoms[k] /= 1.0 + chi2 / (rows * scale * scale)
+        if solve_symmetric(spread, res, white, factor):
+            total = 0.0
+            for a in range(4):
+                total += res[a] * white[a]
+            errors[k] = math.sqrt(max(total, 0.0) / rows)
+    return freedoms, errors
+
+
+@njit
+def pull(pose, velocity, covariance, points, cameras, sigma, scale):
+    """How far from a pose, with covariance (6, 6), the others alone would have it than some `points`, in squared
+    sigmas; inf if it rests on these.
+
+    To first order: at a pose by all, the gradients of these and of the others cancel each other. Arguments as of
+    `optimise_pose`, the last Cauchy scale.
+    """
+    n = 12 if len(points.row_s) > 0 else 6
+    normal, rhs, inverse, factor = np.zeros((n, n)), np.zeros(n), np.full((6, 6), np.inf), np.zeros((6, 6))
+    x = np.zeros(6)
+    normal_equations(
+        pose,
+        velocity,
+        points,
+        points.rho,
+        cameras,
+        sigma,
+        scale,
+        normal,
+        rhs,
+        np.empty(len(points.rho)),
+        np.empty((len(points.rho), 7)),
+    )
+    if not invert_symmetric(covariance, inverse, factor):
+        return math.inf
+    if n == 12:  # the velocity is unknown
+        y, own = np.zeros(6), np.ascontiguousarray(normal[6:, 6:]) + 1e-9 * np.eye(6)
+        for i in range(6):
+            if not solve_symmetric(own, normal[6:, i].copy(), y, factor):
+                return math.inf
+            rhs[i] -= (y * rhs[6:]).sum()
+            for j in range(6):
+                normal[j, i] -= (normal[j, 6:] * y).sum()
+    for i in range(6):
+        for j in range(6):
+            inverse[i, j] -= normal[i, j]
+    if not solve_symmetric(inverse, rhs[:6].copy(), x, factor):
+        return math.inf
+    total = 0.0
+    for i in range(6):
+        total += rhs[i] * x[i]
+    return total
+
+
+@njit
 def refine_depth(pose, velocity, points, inlier, cameras, sigma, floor):
     """Update rho and its variance (in place) by one frame's observations, pose and velocity given.
 
