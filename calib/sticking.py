@@ -28,6 +28,7 @@ from stereo_sfm.calib.start import StartFinding
 from stereo_sfm.types import U8, Bool, StereoImage
 
 IMAGES, WITHIN = 8, 150  # looked at, among so many first ones; they are denser in the beginning
+MIN_S = 2.0  # from the first image to the last: in less a slow robot moves by less than a window
 PAIRS_BEFORE_NOTHING = 3  # images of which so many pairs show no change, or nothing that stays, end the search
 CELLS = 8  # of the image, in each direction
 STRONG = 12.0  # grey levels, standard deviation in windows that tell whether the view changes: no noise hides them
@@ -36,7 +37,7 @@ MIN_WINDOWS = WINDOW * WINDOW // 2  # connected, of a part: half of those that s
 LEAST = 1e-3  # of the image; less than a robot's edge or a drop hides is chance
 CORNER_PX, MIN_ROUND = 9, 0.1  # px, and ratio of the squared gradients across: less is an edge
 MOVING = 0.75  # of the pairs, in which the view of a camera changes that does not rest for half of the images
-GAP_PX = 3  # between a part and what lies around it: windows that show both
+GAP_PX = 3  # between a part and its surroundings: windows that show both
 SAME_AROUND = 0.4  # of the windows around a part; as many look the same by chance and texture
 MIN_LEFT = 0.3  # of the image, where a tracked window shows nothing that sticks: with less, nothing can be masked
 TRACKED_PX = 7  # half of a tracked window, in the half-size image
@@ -56,7 +57,9 @@ def sticking(images: Iterable[StereoImage]) -> list[Bool]:
         images: of the same cameras, in order; no more are read than needed.
     """
     cameras: list[_Camera] = []
+    begin_ns = end_ns = None
     for image in images:
+        begin_ns, end_ns = image.stamp_ns if begin_ns is None else begin_ns, image.stamp_ns
         views = [image.left] if image.right is None else [image.left, image.right]
         cameras = cameras or [_Camera() for _ in views]
         for camera, view in zip(cameras, views, strict=False):
@@ -65,6 +68,8 @@ def sticking(images: Iterable[StereoImage]) -> list[Bool]:
                 return []
         if all(camera.empty for camera in cameras):
             return []
+    if begin_ns is None or end_ns is None or end_ns - begin_ns < MIN_S * 1e9:
+        return []
     if not all(camera.moves for camera in cameras):
         return []
     parts = [camera.part() for camera in cameras]
@@ -178,7 +183,7 @@ def _view_changes(textured: Bool, matching: Bool) -> bool:
 def _parts(stays: Bool, lit: Bool, votes: FixedVotes) -> Bool:
     """The parts of enough windows that end sharply: around what sticks, the view changes as it does everywhere.
 
-    Far scenery ahead of a camera that drives straight on stays, too, but what lies around it stays nearly as well.
+    Far scenery ahead of a camera that drives straight on stays, too, but its surroundings stay nearly as well.
     """
     _, labels, stats, _ = cv2.connectedComponentsWithStats((stays & lit).astype(np.uint8))
     near = uncovered(~stays, GAP_PX) & lit

@@ -62,7 +62,8 @@ def test_sentences_are_short(page: Path) -> None:
 
 
 def test_the_documentation_is_short() -> None:
-    assert sum(len(page.read_text().split()) for page in DOCS if page.name not in NOTEBOOK) <= MOST_WORDS
+    words = [w for page in DOCS if page.name not in NOTEBOOK for w in page.read_text().split() if re.search(r"\w", w)]
+    assert len(words) <= MOST_WORDS  # the bars of tables are none
     assert len((ROOT / "README.md").read_text().split()) <= 560
 
 

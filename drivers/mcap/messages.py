@@ -194,7 +194,8 @@ def _packet_ros(data: bytes) -> ImageMessage:
     stamp_ns, frame = cdr.header()
     cdr.take("i", 2)
     encoding = cdr.text()
-    cdr.take("Q"), cdr.take("B", 2)
+    cdr.take("Q")
+    cdr.take("B", 2)
     return ImageMessage(stamp_ns, frame, True, cdr.blob(), encoding=encoding)
 
 
