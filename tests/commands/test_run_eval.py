@@ -36,7 +36,7 @@ def test_output_folder(euroc_run: Path) -> None:
     assert stats["evaluation"]["odometry"]["ape_m"]["rmse"] < 0.01
     assert stats["ms"]["track"]["p50"] > 0
     report = (euroc_run / "report.md").read_text()
-    assert "ATE" in report and "**PASS**" in report
+    assert "ATE" in report and "**WARN**: IMU used for rotations only" in report  # 1.4 s show no more
     for name in ("trajectory.png", "errors.png", "tracking.png", "times.png"):
         assert (euroc_run / name).read_bytes().startswith(b"\x89PNG") and f"({name})" in report
     assert stereo_sfm.load_rig(euroc_run / "rig.yaml").baseline == pytest.approx(0.1101, abs=1e-4)
