@@ -83,11 +83,9 @@ class KnockDetector:
         self.turn, self._since_ns = self.turn + turn, stamp_ns
         self._usual = np.zeros(3)
 
-    def corrected(self, by_step: bool) -> None:
-        """The map has corrected the rig, whose usual error is another one now. `by_step`: by the rotation seen here."""
-        self._usual = None
-        if by_step:
-            self.turn = np.zeros(3)
+    def confirmed(self) -> None:
+        """The rig has been corrected."""
+        self.turn = np.zeros(3)
 
     def given_up(self, stamp_ns: int) -> bool:
         """Whether the map has not confirmed a rotation for so long that there was none."""

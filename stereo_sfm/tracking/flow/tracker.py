@@ -129,8 +129,8 @@ class Tracker:
         corrected = update.calibration is not None and update.calibration.applied
         if update.calibration is not None and corrected:
             self._rig_terms = update.calibration.terms
-            if self._knock is not None:
-                self._knock.corrected(update.calibration.why == "step")
+            if self._knock is not None and update.calibration.why == "step":
+                self._knock.confirmed()
             self._use_rig()
             self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
         elif self._turn.any():  # the map does not know it yet
