@@ -135,7 +135,7 @@ def _describe_file(path: Path, own_rig: Path | None) -> Description:
     if ENDED_EARLY.items() <= out.metadata.items():
         out.problems.append("the run was killed: the final messages of its stages are missing")
     if out.truncated:
-        out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a repaired copy")
+        out.problems.append(f"{out.truncated} ('stereo-sfm recover' writes a repaired copy)")  # as the reader warns
     if not lean:
         _describe_source(out, path, own_rig)
     return out

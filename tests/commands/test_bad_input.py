@@ -346,9 +346,8 @@ def test_info_warns_once_of_a_truncated_file(cli: Run, tmp_path: Path) -> None:
     assert cli("convert", make_images(tmp_path / "data"), "-o", "whole.mcap", "-q")[0] == 0
     Path("cut.mcap").write_bytes(Path("whole.mcap").read_bytes()[:-1000])
     code, out, err = cli("info", "cut.mcap")
-    assert code == 0 and "problem: truncated" in out
-    assert len(err.splitlines()) == 1 and "truncated" in err
-    assert len(cli("info", "cut.mcap")[2].splitlines()) == 1  # and each time it is asked
+    assert code == 0 and not err and out.count("problem: ") == out.count("problem: truncated") == 1
+    assert cli("info", "cut.mcap")[1].count("problem: truncated") == 1  # and each time it is asked
 
 
 def test_an_empty_recording_leaves_no_file(cli: Run) -> None:
