@@ -39,3 +39,21 @@ class DeviceLost(DeviceError):
 
 class DeviceFault(DeviceError):
     """The camera gives an unexpected answer."""
+
+
+Meanings = tuple[tuple[str, type[DeviceError], str], ...]  # lower-case part of a message, error, its line
+
+
+def translated(error: Exception, camera: str, meanings: Meanings) -> DeviceError:
+    """An exception of a camera's library as one of ours, by the first meaning whose part its message has.
+
+    Args:
+        camera: its name, for messages without a meaning.
+    """
+    if isinstance(error, DeviceError):
+        return error
+    text = str(error).lower()
+    for piece, kind, line in meanings:
+        if piece in text:
+            return kind(line)
+    return DeviceFault(f"{camera}: {str(error).splitlines()[0] if str(error) else type(error).__name__}")

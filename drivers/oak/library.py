@@ -8,7 +8,16 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
+from stereo_sfm.drivers.live.errors import (
+    Busy,
+    DeviceError,
+    DeviceFault,
+    DeviceLost,
+    Meanings,
+    NoPermission,
+    NotFound,
+    translated,
+)
 
 log = logging.getLogger("stereo_sfm")
 
@@ -28,7 +37,7 @@ ENVIRONMENT = {
 }
 
 # Lower-case parts of depthai's messages -> error and message; the first match is used.
-_MEANINGS: tuple[tuple[str, type[DeviceError], str], ...] = (
+_MEANINGS: Meanings = (
     ("no available devices", NotFound, "no OAK attached: plug it into a USB 3 port"),
     ("cannot find any device", NotFound, "no such OAK attached ('stereo-sfm devices' lists the attached ones)"),
     ("insufficient_permissions", NoPermission, "no permission: install the udev rule that 'stereo-sfm udev' prints"),
@@ -68,13 +77,7 @@ def load() -> Any:
 
 def device_error(error: Exception) -> DeviceError:
     """An exception of depthai translated to one of ours."""
-    if isinstance(error, DeviceError):
-        return error
-    text = str(error).lower()
-    for piece, kind, line in _MEANINGS:
-        if piece in text:
-            return kind(line)
-    return DeviceFault(f"OAK: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
+    return translated(error, "OAK", _MEANINGS)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,20 @@ from contextlib import suppress
 from typing import Any
 
 from stereo_sfm.drivers.driver import Attached
-from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
+from stereo_sfm.drivers.live.errors import (
+    Busy,
+    DeviceError,
+    DeviceFault,
+    DeviceLost,
+    Meanings,
+    NoPermission,
+    NotFound,
+    translated,
+)
 
 NO_CAMERA = "no RealSense attached: plug it into a USB 3 port"
 # Lower-case parts of librealsense's messages -> error and message; the first match is used.
-_MEANINGS: tuple[tuple[str, type[DeviceError], str], ...] = (
+_MEANINGS: Meanings = (
     ("no device connected", NotFound, NO_CAMERA),
     ("device disconnected", DeviceLost, "the RealSense was disconnected"),
     ("no such device", DeviceLost, "the RealSense was disconnected"),
@@ -45,13 +54,7 @@ def load() -> Any:
 
 def device_error(error: Exception) -> DeviceError:
     """An exception of librealsense translated to one of ours."""
-    if isinstance(error, DeviceError):
-        return error
-    text = str(error).lower()
-    for piece, kind, line in _MEANINGS:
-        if piece in text:
-            return kind(line)
-    return DeviceFault(f"RealSense: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
+    return translated(error, "RealSense", _MEANINGS)
 
 
 def find(rs: Any) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from stereo_sfm.arrays import read_arrays, write_arrays
 from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
@@ -252,8 +253,7 @@ def _write(path: Path, key: str, columns: dict[str, Any]) -> None:
     """Complete or not at all."""
     part = path.with_suffix(".part")
     try:
-        with part.open("wb") as file:
-            np.savez_compressed(file, key=np.array(key), **columns)
+        write_arrays(part, {"key": np.array(key), **columns})
         part.replace(path)
     except OSError:
         part.unlink(missing_ok=True)
@@ -263,7 +263,7 @@ def _write(path: Path, key: str, columns: dict[str, Any]) -> None:
 def _read(path: Path, key: str | None) -> dict[str, Any] | None:
     """The columns of a file; None where there is none, it is damaged, or it was made of something else."""
     try:
-        with np.load(path) as data:
-            return {name: data[name] for name in data.files} if str(data["key"]) == key else None
-    except (OSError, ValueError, KeyError, EOFError):
+        data = read_arrays(path.read_bytes())
+        return data if str(data["key"]) == key else None
+    except (OSError, ValueError, KeyError):
         return None

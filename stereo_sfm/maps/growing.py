@@ -19,7 +19,7 @@ from stereo_sfm.maps.cameras import difference, unified
 from stereo_sfm.maps.merge import adjust, close_loop, full_adjustment, restore_for_merging, session_closer
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.maps.update import in_frame_of, with_sessions, without_superseded
-from stereo_sfm.types import F64, I64, Keyframe, LoopResult
+from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult
 
 _FRACTION, _ODD = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)  # of the golden ratio, a large prime
 
@@ -120,7 +120,7 @@ class GrowingMap:
             del self._odometry[gone]
             self._map.cull_keyframe(self._map.kf_row(gone))
 
-    def _place(self, s: MapSnapshot, ids: I64, new: list[bool] | np.ndarray, place: LoopResult | None) -> None:
+    def _place(self, s: MapSnapshot, ids: I64, new: Bool, place: LoopResult | None) -> None:
         """Add the new keyframes: each lies to the newest joined one of its submap as in the session."""
         poses, odometry = self._map.keyframes, self._odometry
         reference: dict[int, int] = {}  # submap -> index of its newest joined keyframe; -1: of any
@@ -148,9 +148,8 @@ class GrowingMap:
                 odometry[kf_id] = se3.orthonormalize(own)
                 self._rigs[kf_id], self._session_of[kf_id] = rig, self._session
             reference[submap] = reference[-1] = k
-        return
 
-    def _enter_points(self, s: MapSnapshot, ids: I64, new: np.ndarray) -> I64:
+    def _enter_points(self, s: MapSnapshot, ids: I64, new: Bool) -> I64:
         """Add new points and sightings, cull what the session culled. Returns (P,) the id here of each of its points.
 
         A point is known by what saw it: those that loops made of corners have other ids each time.
@@ -192,7 +191,7 @@ class GrowingMap:
 
     # -- loops -------------------------------------------------------------------------------------------------------
 
-    def _enqueue(self, s: MapSnapshot, ids: I64, new: np.ndarray, pt_ids: I64) -> None:
+    def _enqueue(self, s: MapSnapshot, ids: I64, new: Bool, pt_ids: I64) -> None:
         """New keyframes for the search, with the ids of this map."""
         renamed = dataclasses.replace(s, kf_ids=ids, pt_ids=pt_ids)
         for k, keyframe in enumerate(renamed.keyframes()):
@@ -219,9 +218,8 @@ class GrowingMap:
         close_loop(map_, loop, self._loops, config.loop, config.mapper)
         if len(self._loops) > before:
             self._bent = True
-            adjust(
-                map_, window.covisible_window(map_, map_.kf_row(loop.kf_id), config.mapper), self._rigs, config.mapper
-            )
+            around = window.covisible_window(map_, map_.kf_row(loop.kf_id), config.mapper)
+            adjust(map_, around, self._rigs, config.mapper)
 
     def _adjust(self) -> bool:
         """Adjust the whole map, if loops have bent it."""

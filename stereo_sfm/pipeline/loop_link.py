@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
 from stereo_sfm.pipeline.channels import End, Outbox
+from stereo_sfm.pipeline.restarting_closer import KnownPlaces
 from stereo_sfm.types import FAILED, Keyframe, LoopResult
 
 ANY_NUMBER = 0  # of messages that wait: main never waits for a stage
@@ -35,8 +36,7 @@ class LoopLink:
         self._to_mapper = Outbox(to_mapper, ANY_NUMBER)
         self.closing = True  # else the process gets no keyframes
         self._waiting: dict[int, bytes] = {}  # pickled keyframes without a result, by id
-        self._known: dict[int, bytes] = {}  # that later results may name
-        self._loops: dict[int, LoopResult] = {}  # by their newer keyframe
+        self._known = KnownPlaces[bytes]()
         self._ready = self._over = self._gone = False
         self._proven = True  # this process, or the first one, has given a result
 
@@ -62,14 +62,8 @@ class LoopLink:
     def answered(self, result: LoopResult, data: bytes) -> None:
         """A result and the same, pickled."""
         self._to_mapper.send(data)
-        self._known[result.kf_id] = self._waiting.pop(result.kf_id)
+        self._known.add(result, self._waiting.pop(result.kf_id))
         self._proven |= not result.failed
-        if result.candidate_kf_id >= 0:
-            self._loops[result.kf_id] = result
-        for gone in result.forgotten_kf_ids.tolist():
-            self._known.pop(gone, None)
-        if len(result.forgotten_kf_ids):
-            self._loops = {k: r for k, r in self._loops.items() if {k, r.candidate_kf_id} <= self._known.keys()}
 
     def end(self) -> None:
         """No more keyframes follow."""
@@ -87,11 +81,11 @@ class LoopLink:
         if self._gone or (self._over and not self._waiting):
             return False
         if not self._proven:  # what the last one began with was not the cure
-            self._known, self._loops = {}, {}
+            self._known = KnownPlaces()
         self._ready = self._proven = False
         self._to_loop.close()
         self._to_loop = Outbox(self._begin(), ANY_NUMBER)
-        self._to_loop.send(Known(tuple(self._known.values()), tuple(self._loops.values())))
+        self._to_loop.send(Known(tuple(self._known.keyframes.values()), tuple(self._known.loops)))
         for data in self._waiting.values():
             self._to_loop.send(data)
         if self._over:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import yaml
 
+from stereo_sfm.arrays import write_arrays
 from stereo_sfm.cli import main
 from stereo_sfm.dense import build as module
 from stereo_sfm.dense import inputs
@@ -165,15 +166,14 @@ def test_a_full_disk_is_one_line_and_what_was_fused_stays(
 ) -> None:
     case = Case(monkeypatch)
     made: list[str] = []
-    save = np.savez_compressed
 
-    def full(file: Any, **columns: Any) -> None:
+    def full(path: Path, columns: dict[str, Any]) -> None:
         if len(made) >= 2:
             raise OSError(errno.ENOSPC, "No space left on device")
-        made.append(file.name)
-        save(file, **columns)
+        made.append(path.name)
+        write_arrays(path, columns)
 
-    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr("stereo_sfm.dense.build.write_arrays", full)
     monkeypatch.setattr("stereo_sfm.dense.inputs.find_input", lambda *_: case.given)
     out = tmp_path / "out"
     assert main(["dense", "any", "-o", str(out), "--voxel", "0.08", "--jobs", "1", "-q"]) == 2
