@@ -330,8 +330,8 @@ RULES = (
     # The rig.
     _rule(
         "rotation of the right camera in one image",
-        f"{FLOW}knock.py",
-        "return KnockDetector() if corrects and rig.second_camera is not None else None",
+        f"{FLOW}sudden_turn.py",
+        "return SuddenTurns() if corrects and rig.second_camera is not None else None",
         "return None",
     ),
 )

@@ -108,13 +108,6 @@ def constant(windows: Sequence[RigWindow], expected: Scatter) -> Course:
     return course(windows, np.ones((len(windows), 1)), PRIOR[None], expected)
 
 
-def with_step(before: Sequence[RigWindow], after: Sequence[RigWindow], expected: Scatter) -> Course:
-    """Two columns: the terms before, and what has changed."""
-    columns = np.ones((len(before) + len(after), 2))
-    columns[: len(before), 1] = 0.0
-    return course([*before, *after], columns, np.stack([PRIOR, PRIOR]), expected)
-
-
 def steady(windows: Sequence[RigWindow], span: Sequence[RigWindow], expected: Scatter) -> Course:
     """Two columns: the terms at the end of `span`, and their change over it."""
     end_ns, seconds = span[-1].stamp_ns, (span[-1].stamp_ns - span[0].stamp_ns) * 1e-9

@@ -23,8 +23,7 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
-from stereo_sfm.mapping.rig_change import SeenPoints
-from stereo_sfm.types import F64, I64, RIG_TERMS, Bool
+from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
 
 MIN_POINTS = 20
 MAX_POINTS = 160
@@ -38,6 +37,29 @@ PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 # Prior standard deviations of `_shapes`, px at the image's border.
 LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
 SHARED_PRIOR = np.concatenate([PRIOR, LENS_PRIOR]) ** -2  # information
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """What is known of a keyframe without its images."""
+
+    kf_id: int
+    stamp_ns: int
+    submap_id: int
+    odom_T_cam: F64  # (4, 4)
+    point_ids: I64  # (N,)
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where not seen
+
+    @staticmethod
+    def of(keyframe: Keyframe) -> SeenPoints:
+        k = keyframe
+        return SeenPoints(k.kf_id, k.stamp_ns, k.submap_id, k.odom_T_cam, k.point_ids, k.uv_left, k.uv_right)
+
+    def every(self, step: int, first: int) -> SeenPoints:
+        """With one in `step` of the points: those whose id is `first` modulo `step`."""
+        kept = self.point_ids % step == first
+        return replace(self, point_ids=self.point_ids[kept], uv_left=self.uv_left[kept], uv_right=self.uv_right[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,13 +89,10 @@ class RigWindow:
         F64  # (3,) radians from the first to the last keyframe, zero where the same lenses saw what it is measured with
     )
 
-
-@dataclass(frozen=True, eq=False)
-class EarlierRig:
-    """With its corrections, that of the first keyframes of a window during which the rig changed."""
-
-    rig: Rig
-    keyframes: int
+    def turned(self, change: F64) -> RigWindow:
+        """If the rig's terms had been others, by `change` (8,)."""
+        matrix, vector = self.information.matrix, self.information.vector
+        return replace(self, information=RigInformation(matrix, vector + matrix @ change))
 
 
 @dataclass(eq=False)
@@ -82,55 +101,32 @@ class _Problem:
 
     uv_left: F64  # (F, N, 2) px
     uv_right: F64  # (F, N, 2) px
-    known: Bool  # (F,) seen by a known rig
     bearing: F64  # (N, 3) unit, first left camera
     rho: F64  # (N,) 1/m
     frame_T_first: F64  # (F, 4, 4)
     shapes: F64  # (2, F, N, 2, L) px
     lens: F64  # (L,)
 
-    def seen_by(self, rig: Rig, before: EarlierRig | None) -> _Problem:
-        """With the right pixels that `rig` would have seen instead of the rig `before` it."""
-        if before is None:
-            return self
-        uv_right = self.uv_right.copy()
-        for f in np.flatnonzero(self.known):
-            pose = self.frame_T_first[f]
-            points = self.bearing @ pose[:3, :3].T + self.rho[:, None] * pose[:3, 3]
-            uv_right[f] += _right_pixels(rig, points, self.rho) - _right_pixels(before.rig, points, self.rho)
-        return replace(self, uv_right=uv_right)
 
-
-def _right_pixels(rig: Rig, points: F64, rho: F64) -> F64:
-    """(N, 2) px of points (N, 3), left camera, scaled by their inverse distances (N,)."""
-    assert rig.right is not None
-    return rig.right.project((points - rho[:, None] * rig.left_T_right[:3, 3]) @ rig.left_T_right[:3, :3])
-
-
-def solve_window(
-    rig: Rig, keyframes: Sequence[SeenPoints], terms: F64, before: EarlierRig | None = None
-) -> RigWindow | None:
+def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWindow | None:
     """The information of a window, or None if its keyframes have too few common points.
 
     Args:
-        rig: the calibrated rig. keyframes: in order of time, the newest of another rig first. terms: (8,) initial
-            corrections.
-        before: the rig of the first keyframes, where it changed (a knock). What it measured of the points is what the
-            changed one is measured with.
+        rig: the calibrated rig. keyframes: in order of time. terms: (8,) initial corrections.
     """
     corrected = with_terms(rig, terms)
-    problem = _problem(corrected, keyframes, 0) if before is None else _problem(before.rig, keyframes, before.keyframes)
+    problem = _problem(corrected, keyframes)
     if problem is None:
         return None
     sigma = 1.0
     for step in range(STEPS):
-        system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=step >= 2)
+        system = _System.of(corrected, problem, sigma, hard=step >= 2)
         sigma = system.noise_px
         terms = terms + system.step(problem, terms)
         if not np.isfinite(terms).all():
             return None
         corrected = with_terms(rig, terms)
-    system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=True)
+    system = _System.of(corrected, problem, sigma, hard=True)
     information = system.information(problem, terms)
     last = keyframes[-1]
     length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
@@ -158,14 +154,12 @@ def _lengthened(rig: Rig) -> tuple[Rig, ...]:
     return tuple(with_terms(rig, steps[k]) for k in LENGTHENING)
 
 
-def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem | None:
-    """`rig`: of the first keyframe. `known`: keyframes of a rig whose terms are known."""
+def _problem(rig: Rig, keyframes: Sequence[SeenPoints]) -> _Problem | None:
     first = keyframes[0]
     both = np.isfinite(first.uv_left).all(1) & np.isfinite(first.uv_right).all(1)
-    later = np.concatenate([k.point_ids for k in keyframes[max(known, 1) :]])
+    later = np.concatenate([k.point_ids for k in keyframes[1:]])
     ids = first.point_ids[both & np.isin(first.point_ids, later)]
-    if not known:
-        ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
+    ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
     if len(ids) < MIN_POINTS:
         return None
     uv = np.full((2, len(keyframes), len(ids), 2), np.nan)
@@ -177,10 +171,7 @@ def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem 
     frames = np.array([se3.inverse(k.odom_T_cam) @ first.odom_T_cam for k in keyframes])
     uv = np.ascontiguousarray(uv[:, :, good])
     shapes = _shapes(rig.left, uv)
-    if known:  # the same lenses saw what the changed rig is measured with
-        shapes[:] = 0.0
-    of_known = np.arange(len(keyframes)) < known
-    return _Problem(uv[0], uv[1], of_known, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
+    return _Problem(uv[0], uv[1], bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
 
 
 def _shapes(camera: Camera, uv: F64) -> F64:
@@ -227,8 +218,8 @@ class _System:
             np.ascontiguousarray(problem.frame_T_first[:, :3, 3]), problem.shapes, problem.lens,
             (rig.left.model_id, rig.left.params, rig.right.model_id, rig.right.params),
             np.ascontiguousarray(rotation.T), rig.left_T_right[:3, 3].copy(),
-            np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard, problem.known,
-             h, g, gain, gradient, squares, rows,
+            np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard,
+            h, g, gain, gradient, squares, rows,
         )  # fmt: skip
         own = h[shared:, shared:] + 1e-6 * np.eye(size - shared)
         pose_gain = np.asarray(np.linalg.solve(own, h[shared:, :shared]), float)

@@ -51,7 +51,7 @@ def _lens_rows(shape, lens, j_rig, residual, at):
 @njit
 def accumulate(
     uv_left, uv_right, bearing, tangent, rho, rot, pos, shapes, lens, cams, right_r, baseline, by_direction, sigma,
-    hard, known, h, g, gain, gradient, size, rows,
+    hard, h, g, gain, gradient, size, rows,
 ):  # fmt: skip
     """Fills the reduced normal equations and what gives the points' own steps.
 
@@ -63,7 +63,6 @@ def accumulate(
         right_r: (3, 3) rotation of right_T_left. baseline: (3,) right camera in the left one.
         by_direction: (3, 2) derivative of rho-scaled right coordinates by the baseline's direction.
         sigma: px. hard: drop what is beyond six sigmas.
-        known: (F,) moments whose right pixels say nothing of the terms: they were seen by a known rig.
         h: (R, R), g: (R,), R = 8 + L + 6 (F - 1), overwritten. gain: (N, 3, R), gradient: (N, 3), overwritten.
         size: (N,) sum of squared residuals. rows: (N,) how many.
     """
@@ -136,8 +135,6 @@ def accumulate(
                         a, b = q[0] / q[2], q[1] / q[2]
                         j_rig[2, 6], j_rig[3, 6] = -params_r[0] * b * b, params_r[1] * a * b
                         j_rig[2, 7], j_rig[3, 7] = -params_r[0] * a * b, params_r[1] * a * a
-                    if known[f]:
-                        j_rig[2:, :RIG_TERMS] = 0.0
                     for k in range(2):
                         j0, j1, j2 = out[2 + 3 * k], out[3 + 3 * k], out[4 + 3 * k]
                         for i in range(3):

@@ -11,11 +11,9 @@ good. Points are tracked where a wrong rig expects them, and agree with it a lit
 a large correction, those before it are discarded. Where the windows show drift (temperature), the rig is known to be
 wrong: the terms at the newest window are used from it on, and the windows since the last revision are on the way there.
 
-After a sudden change of the rig (a knock) earlier windows are discarded, and the correction applies from the first
-keyframe on that was seen by the changed rig. What the rig before it measured of the points that are seen before and
-after it is what the changed rig is measured with, besides the windows since. The tracker notices a rotation at once
-(`tracking.flow.knock`); other changes, and small ones, show where the newest windows contradict all earlier ones by
-more than these contradict each other, and by more than turning explains.
+A sudden rotation of the right camera is noticed and measured by the tracker (`tracking.flow.sudden_turn`). Once it has
+stayed for some keyframes, the rig is corrected by it from the first of these on, and what the windows before it showed
+of the rig goes on to hold for the rig so turned.
 """
 
 from __future__ import annotations
@@ -26,12 +24,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Choice, Estimate, choose, significant, with_terms
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Choice, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
-from stereo_sfm.mapping.rig_course import Scatter, constant, steady, with_step
-from stereo_sfm.mapping.rig_window import EarlierRig, RigWindow, solve_window
+from stereo_sfm.mapping.rig_course import Scatter, constant, steady
+from stereo_sfm.mapping.rig_window import RigWindow, SeenPoints, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
 OF_ROTATION = np.arange(RIG_TERMS) < 3  # of the right camera
@@ -46,16 +43,9 @@ INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])  # windows that each term needs:
 ENOUGH_WINDOWS = 4  # for halves of two windows each
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
-AFTER_STEP = range(4, 11)  # newest windows that must contradict all others to indicate a step; they look elsewhere:
-ELSEWHERE_RAD, ELSEWHERE_WINDOWS = 0.35, 8  # they have turned by a third of a usual view, or are so many
-BEFORE_STEP = 4  # earlier windows needed to detect a step
-STEP_REACH = 2  # windows before and after the likeliest pair of windows in which it may have happened
-RECENT_KEYFRAMES = 64  # among which the first after a step is looked for
-ACROSS_STEP = 6, 4  # keyframes before and after it from which the changed rig is measured
-KNOCK_KEYFRAMES = 2  # after a rotation that the tracker noticed, from which the changed rig is first measured
+TURNED_KEYFRAMES = 4  # for which a rotation that the tracker noticed must stay the same: as many as a window has
 DRIFT_WINDOWS = 8  # needed to detect drift
 SIGMAS = 4.0  # significance of the first term that is corrected, and of drift
-STEP_SIGMAS = 5.0  # of a step, which is looked for between all windows
 # Of others, once the calibration is known to be wrong: Akaike's criterion, but for those by which cameras err least.
 FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [3, 4, 6, 7]), SIGMAS, np.sqrt(2.0))
 REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
@@ -92,14 +82,12 @@ class SelfCalibration:
         self._keyframes: list[SeenPoints] = []
         self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
+        self._stamp_ns = 0  # newest keyframe
         self._revised_ns = 0  # newest keyframe of the last revision
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
-        self._stepped = False  # a step was detected and is not yet corrected
-        self._step_between = 0, 0  # keyframes between which it happened
-        self._recent: deque[SeenPoints] = deque(maxlen=RECENT_KEYFRAMES)
         self._turn: F64 = np.zeros(3)  # that the tracker noticed
-        self._turned_kf_id = -1  # first keyframe since; -1: the rig has been measured
+        self._turned_kf_id = -1  # first keyframe since; -1: the rig has been corrected
         half_width = 0.5 * rig.left.width
         turn, roll = 1 / rig.left.fx, 2 / half_width
         decentering = roll * rig.left.fx / half_width
@@ -111,21 +99,21 @@ class SelfCalibration:
 
     def add(self, keyframe: Keyframe) -> Revision | None:
         """Add a keyframe; returns a revision when one becomes significant."""
-        seen = SeenPoints.of(keyframe)
-        self._recent.append(seen)
-        knock = self._knock(keyframe)
-        if knock is not None:
-            return knock
+        seen, self._stamp_ns = SeenPoints.of(keyframe), keyframe.stamp_ns
+        turned = self._sudden_turn(keyframe)
         if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
-        if self._keyframes and not _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width):
+        if not self._keyframes or _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width):
+            self._keyframes.append(seen)
+        elif turned is None:
             return None
-        self._keyframes.append(seen)
+        if turned is not None or self._turned_kf_id >= 0:
+            return turned
         if len(self._keyframes) == FIRST_KEYFRAMES and not (self.windows or self._corrected.any()):
             return self._at_first_sight()
         if len(self._keyframes) < KEYFRAMES or not self._close_window():
             return None
-        if self._until_due > 0 and not self._stepped:
+        if self._until_due > 0:
             return None
         return self._revise()
 
@@ -164,11 +152,10 @@ class SelfCalibration:
         self._keyframes = []
         if window is not None:
             if len(self.windows) == MAX_WINDOWS:
-                self._since = self.windows[1].first_kf_id
+                self._since = max(self._since, self.windows[1].first_kf_id)
             self.windows.append(window)
             self._until_due -= 1
             self._drop_misled()
-            self._detect_step()
         return window is not None
 
     def _drop_misled(self) -> None:
@@ -186,9 +173,6 @@ class SelfCalibration:
         found = self._change(windows, drift, refined_sigmas)
         if found is None:
             return None
-        if self._stepped:
-            self._since, self._stepped = self._first_after_step(self.terms + found.value), False
-            return self._revision(self._measured_across(self._since, found), "step", self._since)
         if drift is not None:
             return self._revision(found, "drift", windows[-1].first_kf_id, self._on_the_way(found.value))
         why = "refined" if self._corrected[found.written].all() else "significant"
@@ -263,48 +247,26 @@ class SelfCalibration:
         ])  # fmt: skip
         return bool(gains.mean() > HELPING_SIGMAS * gains.std() / np.sqrt(len(gains) - 1))
 
-    def _turned(self, across: RigWindow | None) -> _Change | None:
-        """A rotation of the right camera, which a window across it shows; None: it shows none.
+    def _sudden_turn(self, keyframe: Keyframe) -> Revision | None:
+        """The revision of a rotation that the tracker noticed, once it has stayed the same for some keyframes.
 
-        Few keyframes tell it from other terms badly: it must be there whatever these are, and beside them.
+        What the windows before it said of the rig goes on to hold, for the rig so turned.
         """
-        if across is None:
+        if not np.array_equal(keyframe.right_turn, self._turn):
+            self._turn, self._keyframes = keyframe.right_turn, []
+            self._turned_kf_id = keyframe.kf_id if self._turn.any() else -1
+        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + TURNED_KEYFRAMES - 1:
             return None
-        whole = self._beyond(self.terms, constant([across], self._expected).at([1.0]))
-        alone = whole.ignoring(~OF_ROTATION)
-        choice, beside = (choose(e, [e], self._rig.readout_s > 0, SIGMAS) for e in (alone, whole))
-        if not (choice.written & beside.written).any():
-            return None
-        return _Change(choice.value, choice.sigma, alone.covariance, choice.written)
-
-    def _knock(self, keyframe: Keyframe) -> Revision | None:
-        """The revision of a rotation that the tracker noticed, once a few keyframes confirm it."""
-        turn = keyframe.right_turn
-        if turn.any() and (not self._turn.any() or (self._turned_kf_id < 0 and not np.array_equal(turn, self._turn))):
-            self._turned_kf_id = keyframe.kf_id
-        self._turn = turn
-        after = sum(k.kf_id >= self._turned_kf_id for k in self._recent)
-        if not turn.any() or self._turned_kf_id < 0 or not KNOCK_KEYFRAMES <= after <= ACROSS_STEP[1]:
-            return None
-        self._before_change()
-        initial = self.terms.copy()
-        initial[:3] += turn
-        across = self._across(len(self._recent) - after, initial)
-        found = self._turned(across)
-        if across is None or found is None:
-            return None
-        self._since, self._step_between = self._turned_kf_id, (self._turned_kf_id - STEP_REACH, keyframe.kf_id)
-        first = self._first_after_step(self.terms + found.value)
-        if first < self._since:  # it was noticed some images late
-            self._since, after = first, sum(k.kf_id >= first for k in self._recent)
-            again = self._across(len(self._recent) - after, self.terms + found.value)
-            across = across if again is None else again
-            found = self._turned(across) or found
-        self.windows = deque([across], maxlen=MAX_WINDOWS)
-        self._keyframes = list(self._recent)[-after:]
-        self._stepped = False
-        self._turned_kf_id, self._until_due = -1, MIN_WINDOWS
-        return self._revision(found, "step", self._since)
+        change, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
+        change[OF_ROTATION] = self._turn
+        covariance[:3, :3] = keyframe.right_turn_covariance
+        sigma = np.sqrt(np.diag(covariance))
+        self.windows = deque((w.turned(change) for w in self.windows), maxlen=MAX_WINDOWS)
+        self._since, self._turned_kf_id = self._turned_kf_id, -1
+        found = _Change(change, sigma, covariance, np.abs(change) > SIGMAS * sigma)
+        revision = self._revision(found, "step", self._since)
+        self._sigma = np.full(RIG_TERMS, np.inf)
+        return revision
 
     def _revision(
         self, change: _Change, why: str, since_kf_id: int, on_the_way: tuple[tuple[int, F64], ...] = ()
@@ -312,30 +274,9 @@ class SelfCalibration:
         self.terms = self.terms + change.value
         self._corrected |= change.written
         self._sigma = change.sigma
-        self._revised_ns = self._recent[-1].stamp_ns
+        self._revised_ns = self._stamp_ns
         text = _text(change.value, change.sigma)
         return Revision(self.terms.copy(), change.covariance, since_kf_id, why, text, on_the_way)
-
-    def _across(self, at: int, terms: F64) -> RigWindow | None:
-        """Of the newest keyframes, those from `at` on, measured with what the rig before them knew of their points.
-
-        `terms`: initial ones.
-        """
-        recent = list(self._recent)
-        before, after = recent[max(at - ACROSS_STEP[0], 0) : at], recent[at : at + ACROSS_STEP[1]]
-        if not before or any(k.submap_id != before[0].submap_id for k in (*before, *after)):
-            return None
-        earlier = EarlierRig(with_terms(self._rig, self.terms), len(before))
-        return solve_window(self._rig, [*before[::-1], *after], terms, earlier)
-
-    def _measured_across(self, since_kf_id: int, found: _Change) -> _Change:
-        """A step's change, measured with what the rig before it knew of the points."""
-        at = next((i for i, k in enumerate(self._recent) if k.kf_id == since_kf_id), 0)
-        across = self._across(at, self.terms + found.value)
-        if across is None:
-            return found
-        self.windows.appendleft(across)
-        return self._change(list(self.windows)) or found
 
     def _basis(self, windows: Sequence[RigWindow]) -> F64:
         """(8, 8) from the terms to those that are chosen: instead of the rotation about y, the one that changes lengths
@@ -359,50 +300,6 @@ class SelfCalibration:
         change, *halves = [c.at([0.0, 1.0]) for c in courses]
         terms = significant(change, halves, self._rig.readout_s > 0, SIGMAS)
         return _Drift(terms, [c.with_zero(1, ~terms).at([1.0, 0.0]) for c in courses]) if terms.any() else None
-
-    def _detect_step(self) -> None:
-        """Whether the newest windows contradict all earlier ones; during the one before them it may have happened."""
-        windows = list(self.windows)
-        splits = range(len(windows) - AFTER_STEP.start, max(BEFORE_STEP, len(windows) - AFTER_STEP.stop), -1)
-        if not any(self._step(windows[: k - 1], windows[k:]) for k in splits):
-            return
-        near = range(splits[-1], len(windows) - 1)
-        split = max(near, key=lambda k: self._across_windows(windows[: k - 1], windows[k:]).reach)
-        self._before_change(windows[: split - 1])
-        self.windows = deque(windows[split:], maxlen=MAX_WINDOWS)
-        self._since, self._stepped = windows[split].first_kf_id, True
-        self._step_between = windows[split - STEP_REACH].first_kf_id, windows[split:][:STEP_REACH][-1].last_kf_id
-
-    def _across_windows(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> Estimate:
-        """The change of the terms from some windows to others, which may all share one window's error: of a mount that
-        gives until the next turn.
-        """
-        course = with_step(before, after, self._expected)
-        change = course.at([0.0, 1.0])
-        return Estimate(change.value, change.covariance + course.scatter.covariance, change.freedom)
-
-    def _step(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
-        """Whether there is a significant change that each half of the windows after it shows."""
-        turned = sum(float(np.linalg.norm(w.turn)) for w in after)
-        change = self._across_windows(before, after)
-        if change.reach < STEP_SIGMAS or (turned < ELSEWHERE_RAD and len(after) < ELSEWHERE_WINDOWS):
-            return False
-        halves = [self._across_windows(before, part) for part in (after[::2], after[1::2])]
-        sigmas = np.where(self._taken_back, np.inf, STEP_SIGMAS)
-        return bool(significant(change, halves, self._rig.readout_s > 0, sigmas).any())
-
-    def _before_change(self, windows: Sequence[RigWindow] = ()) -> None:
-        """Expect of the windows after a change the scatter of those (all by default) before it, and any change."""
-        self._sigma = np.full(RIG_TERMS, np.inf)
-        if windows or self.windows:
-            self._expected = constant(windows or list(self.windows), self._expected).scatter
-
-    def _first_after_step(self, terms: F64) -> int:
-        """Id of the first keyframe that the rig with these terms saw, else of the first window after the step."""
-        first, last = self._step_between
-        seen = [k for k in self._recent if first <= k.kf_id <= last]
-        found = first_changed(seen, with_terms(self._rig, self.terms), with_terms(self._rig, terms))
-        return self._since if found is None else found
 
 
 @dataclass(frozen=True, eq=False)

@@ -150,8 +150,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
     Args: patient, images may wait for code: only that of the first one is loaded, the rest when it is called.
     """
     from stereo_sfm.loop.database import PlaceDatabase
-    from stereo_sfm.mapping.rig_change import SeenPoints
-    from stereo_sfm.mapping.rig_window import solve_window
+    from stereo_sfm.mapping.rig_window import SeenPoints, solve_window
     from stereo_sfm.mapping.self_calibration import SelfCalibration
 
     if stage == "tracker":

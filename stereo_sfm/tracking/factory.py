@@ -41,13 +41,13 @@ def _tracker(
 ) -> AnyTracker:
     method = config.odometry.method
     if method == "flow":
-        from stereo_sfm.tracking.flow.knock import KnockDetector
         from stereo_sfm.tracking.flow.place_corners import PlaceCorners
         from stereo_sfm.tracking.flow.side_views import SideViews
+        from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
         from stereo_sfm.tracking.flow.tracker import Tracker
 
         corners, sides = PlaceCorners.wanted(config, rig), SideViews.wanted(config, rig)
-        return Tracker(config.tracker, rig, spans, corners, places, sides, KnockDetector.wanted(config, rig))
+        return Tracker(config.tracker, rig, spans, corners, places, sides, SuddenTurns.wanted(config, rig))
     from stereo_sfm.tracking.features.estimators import estimator
 
     if not rig.stereo and estimator(method).needs_depth:

@@ -17,6 +17,7 @@ from stereo_sfm.tracking.flow.place_corners import SCALE, PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
+from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.types import F64, Corners, Keyframe, MotionLink, StereoImage
@@ -88,14 +89,14 @@ class Keyframes:
         covariance: F64,
         submap_id: int,
         rig_terms: F64,
-        right_turn: F64,
+        sudden: SuddenTurns | None,
         sensors: MotionSensors | None = None,
     ) -> Keyframe:
         """A keyframe of an image, without points: see `describe`.
 
         Args:
             odom_T_cam: (4, 4), which the sensors have accepted. covariance: (6, 6) of it. rig_terms: (8,) current
-                correction of the rig. right_turn: (3,) rotation of the right camera besides.
+                correction of the rig. sudden: rotation of the right camera besides.
         """
         keyframe = Keyframe(
             kf_id=self.count,
@@ -109,7 +110,7 @@ class Keyframes:
             descriptors=np.zeros((0, 32), np.uint8),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
-            right_turn=right_turn.copy(),
+            **({} if sudden is None else {"right_turn": sudden.turn, "right_turn_covariance": sudden.covariance}),
             odometry=self._moved(odom_T_cam, covariance) if submap_id == self._submap_id else None,
             **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )

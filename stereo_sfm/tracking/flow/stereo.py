@@ -79,12 +79,20 @@ class StereoMatcher:
         return klt.build_pyramid(image.right, self._config.pyramid_levels)
 
     def follow(
-        self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64, points: F64, predicted: F64, offset: F64
+        self,
+        left: klt.Pyramid,
+        right: klt.Pyramid | F32,
+        uv: F64,
+        points: F64,
+        predicted: F64,
+        offset: F64,
+        level: int = 0,
     ) -> F64:
         """Right pixels (N, 2) of tracked points (N, 3) whose left pixels are `uv`, NaN where not found.
 
         Args:
-            predicted: (4, 4) odom_T_cam. offset: (N, 2) px, see `Tracks.right_offset`.
+            predicted: (4, 4) odom_T_cam. offset: (N, 2) px, see `Tracks.right_offset`. level: of the pyramids, from
+                which on they are looked for.
         """
         if not isinstance(right, tuple):
             return self._from_depth(right, uv)[0]
@@ -93,7 +101,7 @@ class StereoMatcher:
         assert self._rig.right is not None
         guess = self._rig.right.project(se3.transform(self._cameras.right_T_left, points_cam))
         guess += uv - guess_left + offset
-        fitted, _, failed = self._on_one_surface(left, right, uv, self._refine(left, right, uv, guess, 0))
+        fitted, _, failed = self._on_one_surface(left, right, uv, self._refine(left, right, uv, guess, level))
         fitted[failed >= 1.0] = np.nan
         return fitted
 

@@ -27,7 +27,6 @@ from stereo_sfm.tracking.flow.consensus import Movers, after_frame, static_frame
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.keyframes import Keyframes
-from stereo_sfm.tracking.flow.knock import KnockDetector
 from stereo_sfm.tracking.flow.loss import Loss
 from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
@@ -40,6 +39,7 @@ from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
+from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.trusted_motion import Expectation
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
@@ -63,6 +63,8 @@ CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard dev
 HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
+FEW_RIGHT = 0.75  # of the share of points that had a right pixel before: they are looked for farther away ...
+RIGHT_LEVEL = 2  # ... from this level of the pyramids on
 
 
 class Tracker:
@@ -76,17 +78,17 @@ class Tracker:
         place_corners: PlaceCorners | None = None,
         places: Places | None = None,
         side_views: SideViews | None = None,
-        knock: KnockDetector | None = None,
+        sudden: SuddenTurns | None = None,
     ) -> None:
         """Args:
         place_corners: detector of the corners for place recognition; None: keyframes have none.
         places: relocalization after a loss of tracking; None: there is none.
         side_views: views for place recognition in the opposite direction; None: keyframes have none.
-        knock: None: the mapper does not correct the rig.
+        sudden: None: the mapper does not correct the rig.
         """
         self._config, self._rig = config, rig
         self._rig_terms: F64 = np.zeros(RIG_TERMS)  # current correction of the rig
-        self._knock = knock
+        self._sudden = sudden
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
@@ -128,9 +130,9 @@ class Tracker:
             self._sensors.use(update.sensors, with_sensor_terms(self._rig, update.sensors))
         corrected = update.calibration is not None and update.calibration.applied
         if update.calibration is not None and corrected:
+            if self._sudden is not None and update.calibration.why == "step":
+                self._sudden.confirmed((update.calibration.terms - self._rig_terms)[:3])
             self._rig_terms = update.calibration.terms
-            if self._knock is not None and update.calibration.why == "step":
-                self._knock.confirmed()
             self._use_rig()
             self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
         elif self._turn.any():  # the map does not know it yet
@@ -150,8 +152,6 @@ class Tracker:
             self._sensors.feed(image)
         if self._state == TrackState.INITIALIZING:
             return self._begin(image, images)
-        if self._knock is not None and self._knock.given_up(image.stamp_ns):
-            self._use_rig()
         expected = self._predict(image.stamp_ns)
         blind = self._loss.frames and self._sensors is None
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
@@ -212,7 +212,7 @@ class Tracker:
     @property
     def _turn(self) -> F64:
         """(3,) by which the right camera has turned suddenly, which the rig's correction does not contain."""
-        return np.zeros(3) if self._knock is None else self._knock.turn
+        return np.zeros(3) if self._sudden is None else self._sudden.turn
 
     def _use_rig(self) -> None:
         """Use the rig as it is now known."""
@@ -237,25 +237,25 @@ class Tracker:
             self._resumed_T_odom = self._pose @ se3.inverse(solution.pose) @ self._resumed_T_odom
             self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
 
-    def _after_knock(
+    def _after_sudden_turn(
         self, tracks: Tracks, solution: PoseSolution | None, images: StereoPyramids, expected: ExpectedMotion
     ) -> tuple[Tracks, PoseSolution] | None:
         """The pose of an image in which the right camera has turned suddenly; None if it has not.
 
         `tracks`, `solution`: without that; None where it is not good, and one from the left image alone is tried.
         """
-        stamp_ns = self._stamp_ns + round(1e9 * expected.seconds)
-        if self._knock is None or not self._knock.watches(stamp_ns):
+        if self._sudden is None:
             return None
+        found, before = (np.isfinite(t.uv_right[:, 0]).mean() if len(t) else 0.0 for t in (tracks, self._tracks))
+        if found < FEW_RIGHT * before:
+            tracks = self._match_right(tracks, images, expected, RIGHT_LEVEL)
         if solution is None:
             by_left = replace(tracks, uv_right=np.full_like(tracks.uv_right, np.nan))
             solution = self._solver.solve(by_left, expected, self._pose, self._static_count())
             if not solution.good(self._config, self._static_count()):
                 return None
-        turn = self._knock.seen(tracks, solution, self._solver.cameras, expected.seconds)
-        if turn is None:
+        if not self._sudden.seen(self._tracks, self._pose, tracks, solution.pose, self._solver.cameras):
             return None
-        self._knock.add(turn, stamp_ns)
         self._use_rig()
         return self._track(images, expected)
 
@@ -281,9 +281,9 @@ class Tracker:
         """
         tracks, solution = self._track(images, expected)
         good = solution.good(self._config, self._static_count())
-        knocked = self._after_knock(tracks, solution if good else None, images, expected)
-        if knocked is not None:
-            return knocked
+        turned_suddenly = self._after_sudden_turn(tracks, solution if good else None, images, expected)
+        if turned_suddenly is not None:
+            return turned_suddenly
         if good:
             return tracks, solution
         for anywhere in (False, True):
@@ -305,12 +305,17 @@ class Tracker:
         """
         with self._spans.span("flow"):
             tracks = self._follower.follow(self._tracks, self._pose, images.left, expected, blurred)
-        with self._spans.span("stereo"):
-            tracks.uv_right = self._stereo.follow(
-                images.left, images.right, tracks.uv, tracks.points(), expected.pose, tracks.right_offset
-            )
+        tracks = self._match_right(tracks, images, expected)
         with self._spans.span("pose"):
             return tracks, self._solver.solve(tracks, expected, self._pose, self._static_count(), blurred)
+
+    def _match_right(self, tracks: Tracks, images: StereoPyramids, expected: ExpectedMotion, level: int = 0) -> Tracks:
+        """The tracks with their right pixels, looked for from a level of the pyramid on: the higher, the farther."""
+        with self._spans.span("stereo"):
+            uv_right = self._stereo.follow(
+                images.left, images.right, tracks.uv, tracks.points(), expected.pose, tracks.right_offset, level
+            )
+        return replace(tracks, uv_right=uv_right)
 
     def _refine(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion, recovered: bool) -> None:
         """Unless the pose was just recovered, learn the noise of points and motion; refine the inliers' distances.
@@ -529,7 +534,7 @@ class Tracker:
     def _create_keyframe(self, image: StereoImage, images: StereoPyramids, covariance: F64, trusted: bool) -> Keyframe:
         """A keyframe of the image whose pose, with covariance (6, 6), has just been found."""
         keyframe = self._keyframes.create(
-            image, self._pose, covariance, self._submap_id, self._rig_terms, self._turn, self._sensors
+            image, self._pose, covariance, self._submap_id, self._rig_terms, self._sudden, self._sensors
         )
         self._keyframes.points = self._static_count()
         self._undescribed = keyframe, images, trusted

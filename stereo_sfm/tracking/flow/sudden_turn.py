@@ -1,0 +1,184 @@
+"""A sudden rotation of the right camera, noticed in the image in which it happens.
+
+Between two successive images the pose moves what both cameras see alike. What moves the right pixels of all points
+besides, as one rotation of the right camera would, is such a rotation. Errors of the rig, of lenses and of distances
+are the same in both images, so that a hundredth of a degree is seen. How much the rotation scatters from image to image
+(vibration, a mount that gives, cameras that are triggered apart) is learned. Sudden is what the sequence has not shown
+before, and after which the camera stays as it is.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.calib.choice import Estimate
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.order_statistics import median
+from stereo_sfm.geometry.small_matrix import solve_symmetric
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
+from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.types import F64
+
+MIN_POINTS = 20  # common to two images, seen by both cameras: as many as a keyframe's window needs
+STEPS, SCALE = 8, 2.0  # of the robust estimate; its scale over the median deviation of the points
+SIGMAS = 5.0  # of a sudden rotation, as of a step between windows: one is looked for in each image
+# Standard deviation of the rotation from image to image before the sequence shows its own, rad, and as many images as
+# that counts for: a few, so that nothing is sudden while the sequence is new.
+USUAL, USUAL_IMAGES = 2e-4, 4.0
+REMEMBERED_IMAGES = 100.0  # after which what was usual is forgotten
+FOLLOWED_SIGMAS, FOLLOWED_SHARE = 3.0, 0.5  # and share of the rotation, of what the camera turns by after it
+
+
+class SuddenTurns:
+    """Of the right camera; one `seen` per image with a pose."""
+
+    def __init__(self) -> None:
+        self.turn: F64 = np.zeros(3)  # rad about the right camera's axes, since the rig was corrected last
+        self.covariance: F64 = np.zeros((3, 3))  # of `turn`
+        self._followed = np.zeros(3), np.zeros((3, 3))  # by what it has turned in the images since, and covariance
+        self._new = False  # noticed in the last image
+        self._usual: F64 = USUAL**2 * np.eye(3)  # covariance of the rotation from image to image
+        self._images = USUAL_IMAGES  # that have shown it
+
+    @staticmethod
+    def wanted(config: Config, rig: Rig) -> SuddenTurns | None:
+        """Those of a run; None where the mapper does not correct the rig."""
+        corrects = config.self_calibration.mode == "auto" and config.mapper.enabled
+        return SuddenTurns() if corrects and rig.second_camera is not None else None
+
+    def seen(self, before: Tracks, pose_before: F64, tracks: Tracks, pose: F64, cameras: StereoCameras) -> bool:
+        """Whether the right camera has turned suddenly between two images, or does not stay so: `turn` is another then.
+
+        Args:
+            before: with the pixels of the first image. tracks: some of its points, with the pixels of the second.
+            pose_before, pose: (4, 4) odom_T_cam of the images.
+        """
+        static = np.flatnonzero(~tracks.moving)
+        _, of, at = np.intersect1d(tracks.point_ids[static], before.point_ids, True, True)
+        of = static[of]
+        seen = np.isfinite(tracks.uv_right[of, 0] + before.uv_right[at, 0])
+        of, at = of[seen], at[seen]
+        turn, covariance, count = _turn(
+            pose_before, pose, tracks.origin[of], tracks.direction[of], tracks.rho[of],
+            before.uv[at], before.uv_right[at], tracks.uv[of], tracks.uv_right[of], cameras.cams, cameras.right_T_left,
+        )  # fmt: skip
+        if count < MIN_POINTS:
+            return False
+        usual = covariance + self._usual
+        sudden = self._significant(turn, usual)
+        self._images = min(self._images + 1.0, REMEMBERED_IMAGES)
+        self._usual = self._usual + (np.outer(turn, turn) - self._usual) / self._images
+        if sudden and (self._new or not self.turn.any()):  # one rotation may begin during an exposure
+            self.turn, self.covariance, self._new = self.turn + turn, self.covariance + usual, not self._new
+            if not self._significant(self.turn, self.covariance):  # there and back
+                self._forget()
+            return True
+        self._new = False
+        if not self.turn.any():
+            return False
+        followed, uncertain = self._followed[0] + turn, self._followed[1] + usual
+        self._followed = followed, uncertain
+        stays = Estimate(followed, usual).reach < FOLLOWED_SHARE * Estimate(self.turn, usual).reach
+        if sudden or not (stays or Estimate(followed, uncertain).reach < FOLLOWED_SIGMAS):
+            self._forget()
+            return True
+        return False
+
+    def _forget(self) -> None:
+        self.turn, self.covariance = np.zeros(3), np.zeros((3, 3))
+        self._followed = np.zeros(3), np.zeros((3, 3))
+
+    def _significant(self, turn: F64, covariance: F64) -> bool:
+        return Estimate(turn, covariance, self._images).reach > SIGMAS
+
+    def confirmed(self, turn: F64) -> None:
+        """The rig has been corrected by a rotation (3,)."""
+        rest, uncertain = self.turn - turn, self.covariance + self._usual
+        self._forget()
+        if self._significant(rest, uncertain):
+            self.turn, self.covariance = rest, uncertain
+
+
+@njit
+def _turn(pose_a, pose_b, origin, direction, rho, left_a, right_a, left_b, right_b, cams, right_T_left):
+    """The rotation of the right camera between two images, by iteratively re-weighted least squares.
+
+    Args:
+        pose_a, pose_b: (4, 4) odom_T_cam. origin, direction, rho: of the points. Others: (N, 2) their pixels.
+
+    Returns:
+        (3,) rad; its covariance (3, 3) by the scatter of the points; how many have a pixel in both.
+    """
+    count, off, jac = 0, np.zeros((len(rho), 2)), np.zeros((len(rho), 2, 3))
+    unused = np.zeros((2, 3))
+    for k in range(len(rho)):
+        first = _right_shift(pose_a, origin[k], direction[k], rho[k], left_a[k], right_a[k], cams, right_T_left, unused)
+        then = _right_shift(
+            pose_b, origin[k], direction[k], rho[k], left_b[k], right_b[k], cams, right_T_left, jac[count]
+        )
+        off[count, 0], off[count, 1] = then[0] - first[0], then[1] - first[1]
+        if not math.isnan(off[count, 0] + off[count, 1]):
+            count += 1
+    turn, covariance, factor = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    if count < MIN_POINTS:
+        return turn, covariance, 0
+    distance = np.zeros(count)
+    normal, rhs = np.zeros((3, 3)), np.zeros(3)
+    squares, weights = 0.0, 0.0
+    for _ in range(STEPS):
+        for k in range(count):
+            total = 0.0
+            for i in range(2):
+                e = off[k, i] - jac[k, i, 0] * turn[0] - jac[k, i, 1] * turn[1] - jac[k, i, 2] * turn[2]
+                total += e * e
+            distance[k] = math.sqrt(total)
+        scale = max(SCALE * median(distance), 1e-3)
+        normal[:], rhs[:] = 0.0, 0.0
+        squares, weights = 0.0, 0.0
+        for k in range(count):
+            w = 1.0 / (1.0 + (distance[k] / scale) ** 2)
+            squares += w * distance[k] ** 2
+            weights += 2.0 * w
+            for i in range(2):
+                for j in range(3):
+                    rhs[j] += w * jac[k, i, j] * off[k, i]
+                    for m in range(3):
+                        normal[j, m] += w * jac[k, i, j] * jac[k, i, m]
+        if not solve_symmetric(normal, rhs, turn, factor):
+            return turn, covariance, 0
+    unit, column = np.zeros(3), np.zeros(3)
+    for j in range(3):
+        unit[:] = 0.0
+        unit[j] = squares / (weights - 3.0)
+        solve_symmetric(normal, unit, column, factor)
+        covariance[j] = column
+    return turn, covariance, count
+
+
+@njit
+def _right_shift(pose, origin, direction, rho, uv_l, uv_r, cams, right_T_left, jac):
+    """How far a point is from where the right camera should see it, beyond the left one, px; `jac` (2, 3) by its turn.
+
+    NaN where a camera does not see it.
+    """
+    model_l, params_l, model_r, params_r = cams
+    p, q = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            p[i] += pose[j, i] * (origin[j] + direction[j] / rho - pose[j, 3])
+    for i in range(3):
+        q[i] = right_T_left[i, 3]
+        for j in range(3):
+            q[i] += right_T_left[i, j] * p[j]
+    a = project_one(model_l, params_l, p[0], p[1], p[2])
+    b = project_one(model_r, params_r, q[0], q[1], q[2])
+    for i in range(2):
+        j0, j1, j2 = b[2 + 3 * i], b[3 + 3 * i], b[4 + 3 * i]
+        jac[i, 0], jac[i, 1], jac[i, 2] = j1 * q[2] - j2 * q[1], j2 * q[0] - j0 * q[2], j0 * q[1] - j1 * q[0]
+    return (uv_r[0] - b[0]) - (uv_l[0] - a[0]), (uv_r[1] - b[1]) - (uv_l[1] - a[1])
