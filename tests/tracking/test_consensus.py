@@ -52,6 +52,7 @@ def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
         slot=np.arange(n, dtype=np.int64),
         mapped=np.zeros(n, bool),
         moving=np.zeros(n, bool),
+        disagreed=np.zeros(n, bool),
     )
     return tracks, on_person
 
@@ -393,24 +394,44 @@ def test_new_points_where_a_nearer_object_lost_its_points_are_suspect_for_a_seco
     """Who walks towards the camera: no point on him is tracked for long, and he is nearer in every image."""
     tracks, on_person = scene(np.random.default_rng(0))
     tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
+    tracks.disagreed = on_person.copy()
     movers = Movers()
     store = tracks.keep(~on_person)
-    movers.update(tracks, store, 0, STATIC)
+    movers.update(tracks, store, RIG.left, MOVED)
     near, far = (movers.near(tracks.uv[on_person], factor * tracks.rho[on_person], store) for factor in (2.0, 0.5))
     assert near.mean() > 0.9
     assert far.mean() < 0.1
     assert movers.near(store.uv, store.rho, store).mean() < 0.1
-    movers.update(store, store, 1_100_000_000, STATIC)
+    for _ in range(STATIC):
+        movers.update(store, store, RIG.left, MOVED)
     assert not movers.near(tracks.uv[on_person], tracks.rho[on_person], store).any()
 
 
 def test_points_that_were_only_suspect_do_not_make_others_suspect() -> None:
+    """Marks would spread over a still room in which a camera that turns finds new points all the time."""
     tracks, on_person = scene(np.random.default_rng(0))
     tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
-    tracks.age[on_person] = 0
+    tracks.disagreed = np.zeros(len(tracks), bool)
     movers = Movers()
-    movers.update(tracks, tracks.keep(~on_person), 0, STATIC)
+    assert not movers.near(tracks.uv, tracks.rho, tracks).any()
+    movers.update(tracks, tracks.keep(~on_person), RIG.left, MOVED)
     assert not movers.near(tracks.uv[on_person], tracks.rho[on_person], tracks.keep(~on_person)).any()
+    tracks, _ = after_frame(tracks, ~on_person, NONE, 3, alert=True, static=STATIC)
+    assert (movers.near(tracks.uv, tracks.rho, tracks) > 0)[on_person].mean() > 0.9
+
+
+def test_the_place_where_something_moved_stays_where_it_is_in_the_room() -> None:
+    tracks, on_person = scene(np.random.default_rng(0))
+    tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
+    tracks.disagreed = on_person.copy()
+    movers, store = Movers(), tracks.keep(~on_person)
+    movers.update(tracks, store, RIG.left, MOVED)
+    turned = MOVED @ se3.exp(np.array([0, 0, 0, 0, 0.2, 0]))
+    movers.update(store, store, RIG.left, turned)
+    uv = RIG.left.project(se3.transform(se3.inverse(turned), tracks.keep(on_person).points()))
+    store.uv = RIG.left.project(se3.transform(se3.inverse(turned), store.points()))
+    seen = np.isfinite(uv).all(1)
+    assert movers.near(uv[seen], tracks.rho[on_person][seen], store.keep(np.isfinite(store.uv).all(1))).mean() > 0.9
 
 
 def test_an_alert_lasts_while_a_group_disagrees() -> None:

@@ -37,6 +37,7 @@ def view() -> tuple[Follower, F64, Bool]:
         uv=uv,
         uv_right=np.full((n, 2), np.nan),
         right_offset=np.zeros((n, 2)),
+        disagreed=np.zeros(n, bool),
         origin=np.zeros((n, 3)),
         direction=RIG.left.unproject(uv),
         rho=np.full(n, 1 / DISTANCE),

@@ -264,7 +264,7 @@ def wall(uv: F64, at: float = 0.0) -> Tracks:
     return Tracks(
         np.arange(n), uv, uv, np.tile([0.0, 0.0, at], (n, 1)), bearing, bearing[:, 2] / (4.0 - at), np.ones(n),
         np.ones(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 2, 2)), np.arange(n), np.zeros(n, bool),
-        np.zeros(n, bool), np.zeros((n, 2)),
+        np.zeros(n, bool), np.zeros((n, 2)), np.zeros(n, bool),
     )  # fmt: skip
 
 

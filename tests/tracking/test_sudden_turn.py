@@ -47,7 +47,7 @@ class Sequence:
             np.arange(count), self.uv + noise(), uv_right + noise(), np.zeros((count, 3)), self.direction,
             1 / self.depth, np.full(count, 1e-6), np.full(count, 100, np.int32), np.zeros(count, np.int32),
             np.tile(np.eye(2), (count, 1, 1)), np.arange(count), np.zeros(count, bool), np.zeros(count, bool),
-            np.zeros((count, 2)),
+            np.zeros((count, 2)), np.zeros(count, bool),
         )  # fmt: skip
 
     def see(self, degrees: tuple[float, float, float], pose: F64 | None = None, depth: F64 | None = None) -> bool:

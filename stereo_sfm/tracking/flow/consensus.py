@@ -6,13 +6,16 @@ the points tracked longest, among those that are plausible after its recent moti
 or that disagree repeatedly as a group, are marked as moving. They are tracked further, so that no new points are added
 on a moving object, but they do not contribute to the pose until they have been static for a second: somebody who sways
 stands still for a moment, too. A mark is evidence that moves both ways: agreement takes from it, disagreement adds to
-it. New points beside marked ones start with as much as these have, never with more: marks in a still room fade.
+it. New points beside marked ones that disagreed themselves start with as much as these have, never with more: marks in
+a still room fade, and do not spread with the view of a camera that turns.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, I32, I64, Bool, Corners
 
@@ -61,41 +64,46 @@ def after_frame(
     if len(moving):
         group |= moving & ~tracks.moving
     tracks.misses[group] = static
+    tracks.disagreed = (tracks.disagreed | (tracks.moving & ~inlier) | group) & (tracks.misses > 0)
     tracks.moving = (tracks.moving | group) & (tracks.misses > 0)
     kept = ~out | group
     return tracks.keep(kept), kept
 
 
 class Movers:
-    """Where something moves in the image: the points on it, and the places where it lost them within the last second.
+    """Where something moves: the points on it, and the places in the room where it lost them within the last second.
 
-    What comes near changes so much from image to image that no point on it is tracked for long.
+    What comes near changes so much from image to image that no point on it is tracked for long. Evidence are points
+    that have disagreed themselves, not those that are new beside them: else marks would spread over a still room.
     """
 
     def __init__(self) -> None:
-        self._uv: F64 = np.zeros((0, 2))  # px, where points were lost
+        self._places: F64 = np.zeros((0, 3))  # metres, odometry frame, where points were lost
+        self._frames: I32 = np.zeros(0, np.int32)  # in which a point there must agree before it is used
+        self._uv: F64 = np.zeros((0, 2))  # px, of the places in the last image
         self._rho: F64 = np.zeros(0)  # 1/m
-        self._stamp_ns: I64 = np.zeros(0, np.int64)
-        self.static = MIN_STATIC_FRAMES  # frames in which a point beside must agree before it is used
 
     def forget(self) -> None:
         """Nothing is known to move: tracking begins anew."""
-        self._uv, self._rho, self._stamp_ns = np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64)
+        self._places, self._frames = np.zeros((0, 3)), np.zeros(0, np.int32)
+        self._uv, self._rho = np.zeros((0, 2)), np.zeros(0)
 
-    def update(self, before: Tracks, after: Tracks, stamp_ns: int, static: int) -> None:
+    def update(self, before: Tracks, after: Tracks, camera: Camera, pose: F64) -> None:
         """Remember the points that moved in the last image and are not in the tracks `after` it.
 
-        `static`: frames in which moving points must agree before they are used.
+        `pose`: (4, 4) odom_T_cam of the image.
         """
-        self.static = static
-        if not (len(self._rho) or before.moving.any()):
+        lost = before.disagreed & ~np.isin(before.point_ids, after.point_ids)
+        if not (len(self._frames) or lost.any()):
             return
-        moved = before.moving & (before.misses >= static) & (before.age > 0)
-        lost = moved & ~np.isin(before.point_ids, after.point_ids)
-        recent = self._stamp_ns > stamp_ns - int(ALERT_S * 1e9)
-        self._uv = np.concatenate([self._uv[recent], before.uv[lost]])
-        self._rho = np.concatenate([self._rho[recent], before.rho[lost]])
-        self._stamp_ns = np.concatenate([self._stamp_ns[recent], np.full(lost.sum(), stamp_ns)])
+        gone = before.keep(lost)
+        places = np.concatenate([self._places, gone.points()])
+        frames = np.concatenate([self._frames, gone.misses]) - 1
+        in_camera = se3.transform(se3.inverse(pose), places)
+        uv = camera.project(in_camera)
+        kept = (frames > 0) & np.isfinite(uv).all(1)
+        self._places, self._frames, self._uv = places[kept], frames[kept].astype(np.int32), uv[kept]
+        self._rho = 1.0 / np.linalg.norm(in_camera[kept], axis=1)
 
     def near(self, uv: F64, rho: F64, tracks: Tracks, least: int = MOVING_NEIGHBOURS) -> I32:
         """(M,) frames in which new points, (M, 2) px and (M,) 1/m, must agree before they are used.
@@ -106,8 +114,8 @@ class Movers:
         if not (len(self._rho) or tracks.moving.any()):
             return np.zeros(len(uv), np.int32)
         among_uv, among_rho = np.concatenate([tracks.uv, self._uv]), np.concatenate([tracks.rho, self._rho])
-        frames = np.where(tracks.moving, tracks.misses, 0)
-        frames = np.concatenate([frames, np.full(len(self._rho), self.static)])
+        frames = np.where(tracks.disagreed, tracks.misses, 0)
+        frames = np.concatenate([frames, self._frames])
         near, alike = _neighbours(uv, rho, among_uv, among_rho, len(tracks))
         marked = alike & (frames[near] > 0)
         count = marked.sum(1)

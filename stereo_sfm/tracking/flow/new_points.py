@@ -78,6 +78,7 @@ class NewPoints:
                 warp=np.tile(np.eye(2), (n, 1, 1)),
                 slot=slots,
                 mapped=np.zeros(n, bool),
+                disagreed=np.zeros(n, bool),
             )
         )
         self._next_point_id += n

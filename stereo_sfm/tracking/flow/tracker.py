@@ -357,7 +357,7 @@ class Tracker:
         tracks.age = tracks.age + np.int32(1)
         static = static_frames(seconds)
         tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert, static)
-        self._movers.update(self._tracks, tracks, image.stamp_ns, static)
+        self._movers.update(self._tracks, tracks, self._rig.left, solution.pose)
         self._continue(image, images, solution.pose, tracks)
         if self._sensors is not None:
             self._sensors.accept(image.stamp_ns, solution.pose)

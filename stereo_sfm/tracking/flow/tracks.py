@@ -34,6 +34,7 @@ class Tracks:
     moving: Bool = field(default_factory=lambda: np.zeros(0, bool))  # on something that moves: counts for nothing
     mapped: Bool = field(default_factory=lambda: np.zeros(0, bool))  # position given by the map
     right_offset: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px from the epipolar curve, see below
+    disagreed: Bool = field(default_factory=lambda: np.zeros(0, bool))  # itself, since it is marked as moving
 
     def __len__(self) -> int:
         return len(self.point_ids)
