@@ -26,7 +26,8 @@ from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64
 
 MIN_POINTS = 20  # common to two images, seen by both cameras: as many as a keyframe's window needs
-STEPS, SCALE = 8, 2.0  # of the robust estimate; its scale over the median deviation of the points
+STEPS, SCALE = 8, 2.0  # of the robust estimate; its scale over the median deviation of the points ...
+LEAST_PX = 1e-3  # ... and what it is at least
 SIGMAS = 5.0  # of a sudden rotation, as of a step between windows: one is looked for in each image
 # Standard deviation of the rotation from image to image before the sequence shows its own, rad, and as many images as
 # that counts for: a few, so that nothing is sudden while the sequence is new.
@@ -109,66 +110,74 @@ class SuddenTurns:
 def _turn(pose_a, pose_b, origin, direction, rho, left_a, right_a, left_b, right_b, cams, right_T_left):
     """The rotation of the right camera between two images, by iteratively re-weighted least squares.
 
+    Unknown is what else the second image's pose is wrong by, too: a step that is too long changes disparities.
+
     Args:
         pose_a, pose_b: (4, 4) odom_T_cam. origin, direction, rho: of the points. Others: (N, 2) their pixels.
 
     Returns:
         (3,) rad; its covariance (3, 3) by the scatter of the points; how many have a pixel in both.
     """
-    count, off, jac = 0, np.zeros((len(rho), 2)), np.zeros((len(rho), 2, 3))
-    unused = np.zeros((2, 3))
+    count, off, jac = 0, np.zeros((len(rho), 4)), np.zeros((len(rho), 4, 9))
+    first, unused = np.zeros(4), np.zeros((4, 9))
     for k in range(len(rho)):
-        first = _right_shift(pose_a, origin[k], direction[k], rho[k], left_a[k], right_a[k], cams, right_T_left, unused)
-        then = _right_shift(
-            pose_b, origin[k], direction[k], rho[k], left_b[k], right_b[k], cams, right_T_left, jac[count]
+        _residuals(pose_a, origin[k], direction[k], rho[k], left_a[k], right_a[k], cams, right_T_left, first, unused)
+        _residuals(
+            pose_b, origin[k], direction[k], rho[k], left_b[k], right_b[k], cams, right_T_left, off[count], jac[count]
         )
-        off[count, 0], off[count, 1] = then[0] - first[0], then[1] - first[1]
-        if not math.isnan(off[count, 0] + off[count, 1]):
+        for i in range(4):
+            off[count, i] -= first[i]
+        if not math.isnan(off[count].sum()):
             count += 1
-    turn, covariance, factor = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    solution, covariance, factor = np.zeros(9), np.zeros((3, 3)), np.zeros((9, 9))
     if count < MIN_POINTS:
-        return turn, covariance, 0
-    distance = np.zeros(count)
-    normal, rhs = np.zeros((3, 3)), np.zeros(3)
-    squares, weights = 0.0, 0.0
+        return solution[6:], covariance, 0
+    distance, weight, rest = np.zeros((2, count)), np.zeros((2, count)), np.zeros(4)
+    normal, rhs, squares = np.zeros((9, 9)), np.zeros(9), 0.0
     for _ in range(STEPS):
         for k in range(count):
-            total = 0.0
-            for i in range(2):
-                e = off[k, i] - jac[k, i, 0] * turn[0] - jac[k, i, 1] * turn[1] - jac[k, i, 2] * turn[2]
-                total += e * e
-            distance[k] = math.sqrt(total)
-        scale = max(SCALE * median(distance), 1e-3)
+            for i in range(4):
+                rest[i] = off[k, i]
+                for j in range(9):
+                    rest[i] -= jac[k, i, j] * solution[j]
+            distance[0, k], distance[1, k] = math.hypot(rest[0], rest[1]), math.hypot(rest[2], rest[3])
         normal[:], rhs[:] = 0.0, 0.0
-        squares, weights = 0.0, 0.0
+        squares = 0.0
+        for side in range(2):
+            scale = max(SCALE * median(distance[side]), LEAST_PX)
+            for k in range(count):
+                weight[side, k] = 1.0 / (scale**2 + distance[side, k] ** 2)
+                squares += weight[side, k] * distance[side, k] ** 2
         for k in range(count):
-            w = 1.0 / (1.0 + (distance[k] / scale) ** 2)
-            squares += w * distance[k] ** 2
-            weights += 2.0 * w
-            for i in range(2):
-                for j in range(3):
+            for i in range(4):
+                w = weight[i // 2, k]
+                for j in range(9):
                     rhs[j] += w * jac[k, i, j] * off[k, i]
-                    for m in range(3):
+                    for m in range(j + 1):
                         normal[j, m] += w * jac[k, i, j] * jac[k, i, m]
-        if not solve_symmetric(normal, rhs, turn, factor):
-            return turn, covariance, 0
-    unit, column = np.zeros(3), np.zeros(3)
+        for j in range(9):
+            for m in range(j):
+                normal[m, j] = normal[j, m]
+        if not solve_symmetric(normal, rhs, solution, factor):
+            return solution[6:], covariance, 0
+    unit, column = np.zeros(9), np.zeros(9)
     for j in range(3):
         unit[:] = 0.0
-        unit[j] = squares / (weights - 3.0)
+        unit[6 + j] = squares / (4.0 * count - 9.0)
         solve_symmetric(normal, unit, column, factor)
-        covariance[j] = column
-    return turn, covariance, count
+        covariance[j] = column[6:]
+    return solution[6:].copy(), covariance, count
 
 
 @njit
-def _right_shift(pose, origin, direction, rho, uv_l, uv_r, cams, right_T_left, jac):
-    """How far a point is from where the right camera should see it, beyond the left one, px; `jac` (2, 3) by its turn.
+def _residuals(pose, origin, direction, rho, uv_l, uv_r, cams, right_T_left, off, jac):
+    """A point's residuals `off` (4,) px and their derivatives; NaN where a camera does not see it.
 
-    NaN where a camera does not see it.
+    Left, and right beyond left: what the left image is tracked wrong by, the right one is, too. `jac`: (4, 9) by
+    translation and rotation of the left camera's axes, and by the right camera's turn.
     """
     model_l, params_l, model_r, params_r = cams
-    p, q = np.zeros(3), np.zeros(3)
+    p, q, by_p, by_q = np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros(3)
     for i in range(3):
         for j in range(3):
             p[i] += pose[j, i] * (origin[j] + direction[j] / rho - pose[j, 3])
@@ -176,9 +185,22 @@ def _right_shift(pose, origin, direction, rho, uv_l, uv_r, cams, right_T_left, j
         q[i] = right_T_left[i, 3]
         for j in range(3):
             q[i] += right_T_left[i, j] * p[j]
-    a = project_one(model_l, params_l, p[0], p[1], p[2])
-    b = project_one(model_r, params_r, q[0], q[1], q[2])
+    left = project_one(model_l, params_l, p[0], p[1], p[2])
+    right = project_one(model_r, params_r, q[0], q[1], q[2])
     for i in range(2):
-        j0, j1, j2 = b[2 + 3 * i], b[3 + 3 * i], b[4 + 3 * i]
-        jac[i, 0], jac[i, 1], jac[i, 2] = j1 * q[2] - j2 * q[1], j2 * q[0] - j0 * q[2], j0 * q[1] - j1 * q[0]
-    return (uv_r[0] - b[0]) - (uv_l[0] - a[0]), (uv_r[1] - b[1]) - (uv_l[1] - a[1])
+        off[i] = uv_l[i] - left[i]
+        off[2 + i] = uv_r[i] - right[i] - off[i]
+        for j in range(3):
+            by_p[0, j], by_q[j] = left[2 + 3 * i + j], right[2 + 3 * i + j]
+        for j in range(3):
+            by_p[1, j] = -by_p[0, j]
+            for m in range(3):
+                by_p[1, j] += by_q[m] * right_T_left[m, j]
+        for row in range(2):
+            for j in range(3):
+                jac[2 * row + i, j] = by_p[row, j]
+                jac[2 * row + i, 3 + j] = (
+                    by_p[row, (j + 2) % 3] * p[(j + 1) % 3] - by_p[row, (j + 1) % 3] * p[(j + 2) % 3]
+                )
+        for j in range(3):
+            jac[2 + i, 6 + j] = by_q[(j + 1) % 3] * q[(j + 2) % 3] - by_q[(j + 2) % 3] * q[(j + 1) % 3]
