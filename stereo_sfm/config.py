@@ -40,7 +40,10 @@ RENAMED = {
 }
 
 # Settings of earlier versions that decide nothing any more -> what does.
-REMOVED = {"tracker.max_window_disparity_px": "tracker.max_window_difference_sigmas"}
+REMOVED = {
+    "tracker.max_window_disparity_px": "tracker.max_window_difference_sigmas decides",
+    "loop.grow_every": "the vocabulary does not change while it is used",
+}
 
 
 def estimator_names() -> tuple[str, ...]:
@@ -246,7 +249,6 @@ class LoopConfig:
     )
     robust: str = word("gnc", ("gnc", "switchable", "none"), "How the pose graph withstands a false loop")
     vocabulary: str = path("Vocabulary file; empty: the one in the package")
-    grow_every: int = number(0, 0, 1_000_000, "Keyframes between extensions of the vocabulary in a new place; 0: never")
     score_ratio: float = number(0.9, 0, 10, "Candidates must score above this share of the connected keyframes' score")
     reference: str = word(
         "weakest", ("weakest", "best"), "Which of the connected keyframes' scores (weakest finds more; paper: best)"
@@ -363,8 +365,8 @@ def _with_current_names(data: dict[str, Any]) -> dict[str, Any]:
     """One layer of values under current names; logs a warning for each old name."""
     out, met = renamed(data)
     for old in met:
-        what, now = ("is called", RENAMED[old]) if old in RENAMED else ("is ignored: see", REMOVED[old])
-        logging.getLogger("stereo_sfm").warning("configuration: %s %s %s now", old, what, now)
+        now = f"is called {RENAMED[old]} now" if old in RENAMED else f"is ignored: {REMOVED[old]}"
+        logging.getLogger("stereo_sfm").warning("configuration: %s %s", old, now)
     return out
 
 

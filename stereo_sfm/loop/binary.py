@@ -88,12 +88,10 @@ def _assign(words, members, centres):
 
 @njit
 def descend(words, centroids, first_child, child_count):
-    """Leaf node reached by every descriptor, and its distance to that leaf's centroid."""
+    """Leaf node reached by every descriptor."""
     node = np.zeros(words.shape[0], np.int32)
-    distance = np.zeros(words.shape[0], np.int32)
     for i in range(words.shape[0]):
         at = 0
-        low = BITS + 1
         while child_count[at] > 0:
             low = BITS + 1
             start = first_child[at]
@@ -103,8 +101,7 @@ def descend(words, centroids, first_child, child_count):
                     low = d
                     at = c
         node[i] = at
-        distance[i] = low
-    return node, distance
+    return node
 
 
 def k_majority(words: U64, members: I32, k: int, rng: np.random.Generator, rounds: int = 10) -> tuple[U64, I32]:

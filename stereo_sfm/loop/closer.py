@@ -114,11 +114,6 @@ class LoopCloser:
         self._sees_sides = False  # some keyframe had views that face shelves
 
     @property
-    def vocabulary(self) -> Vocabulary:
-        """The current vocabulary, which may have grown."""
-        return self._vocabulary
-
-    @property
     def keyframe_count(self) -> int:
         """Number of keyframes that can be candidates."""
         return len(self._store)
@@ -134,7 +129,6 @@ class LoopCloser:
         result = self._search(keyframe, bags) if keyframe.described else unseen
         self._keep(keyframe, bags)
         gone = self._cull(keyframe.kf_id)
-        self._grow(keyframe)
         return dataclasses.replace(result, forgotten_kf_ids=np.array(gone, np.int64)) if gone else result
 
     def _search(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> LoopResult:
@@ -476,12 +470,6 @@ class LoopCloser:
             rejected=rejected,
             sightings=verdict.sightings,
         )
-
-    def _grow(self, keyframe: Keyframe) -> None:
-        every = self._config.grow_every
-        if every and keyframe.kf_id % every == every - 1:
-            recent = [self._store[k].corners.descriptors for k in self._store.ids[-every:]]
-            self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
 
 
 def _total(support: dict[int, float]) -> float:

@@ -181,7 +181,7 @@ class Relocalizer:
     def _weights(self, keyframe: Keyframe, sideways: bool) -> F64:
         """(N,) of each row of a view: of corners by how rare their words are, of points zero."""
         view, words = self._view(keyframe, sideways), self._vocabularies[sideways]
-        word, _ = words.look_up(view.descriptors)
+        word = words.look_up(view.descriptors)
         return np.where(view.corner, words.idf[word] ** 2, 0.0)
 
     def _evidence(self, keyframe: Keyframe, weights: list[F64], place: Location) -> float:

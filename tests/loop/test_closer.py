@@ -196,14 +196,6 @@ def test_same_sequence_same_bits(vocabulary: voc.Vocabulary) -> None:
     assert bits() == bits()
 
 
-def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
-    sequence = make_sequence([0, 0], seed=7)
-    closer = LoopCloser(dataclasses.replace(LoopConfig(), grow_every=5), sequence.rig, vocabulary)
-    results = [closer.step(k) for k in sequence.keyframes]
-    assert len(closer.vocabulary) > len(vocabulary)
-    assert any(r.candidate_kf_id >= 0 and error_of(sequence, r) < 0.05 for r in results)
-
-
 def test_keyframes_without_corners_are_no_places(vocabulary: voc.Vocabulary) -> None:
     """Every second keyframe is not described: loops are found by the others, and only to the others."""
     sequence = make_sequence([0, 0], seed=6)
