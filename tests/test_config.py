@@ -123,6 +123,11 @@ def test_every_earlier_name_leads_to_a_setting() -> None:
     assert set(RENAMED.values()) <= names and not (set(RENAMED) | set(REMOVED)) & names
 
 
+def test_settings_are_few() -> None:
+    """What can be derived from another setting, or what nobody needs to change, is none."""
+    assert sum("range" in field.metadata for _, field, _ in SETTINGS) <= 80
+
+
 def test_an_explained_configuration_has_every_sentence_and_is_read_back() -> None:
     config = load(overrides=["tracker.max_features=321", "pipeline.cpus.tracker=[0, 1]", "odometry.method=um"])
     text = explain(config)

@@ -31,15 +31,13 @@ from stereo_sfm.loop.sideways import (
 )
 from stereo_sfm.loop.verification import Verdict, corner_sightings, looks_alike, rejection, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.culling import OF_A_VIEW, OF_EARLIER_VISITS, PASSED
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
 PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
-KEPT_NEWEST = 30  # newest keyframes, none of which is removed
-MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
 KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
-MAX_REPEATED = 300  # keyframes added to views of earlier visits; then one goes for each that comes
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
@@ -189,15 +187,15 @@ class LoopCloser:
         Returns:
             Keyframes that are no candidates any more, or never were.
         """
-        settled = newest - KEPT_NEWEST
+        settled = newest - PASSED
         if settled not in self._store:
             return [settled] if settled >= 0 else []
         before = self._store.ids[: bisect(self._store.ids, settled)]
         known = [k for k in self._graph.same_view(settled, KNOWN_VIEWS) if k <= settled]
         came_back = known[0] < max(set(before).difference(known), default=-1)
         same_view = [k for k in self._graph.same_view(settled) if k <= settled]
-        gone = same_view[1] if len(same_view) > MAX_SAME_VIEW else -1
-        if came_back and self._repeated >= MAX_REPEATED:
+        gone = same_view[1] if len(same_view) > OF_A_VIEW else -1
+        if came_back and self._repeated >= OF_EARLIER_VISITS:
             gone = settled
         if gone >= 0:
             self._graph.exclude(gone)
@@ -206,7 +204,7 @@ class LoopCloser:
         self._repeated += came_back and gone < 0
         if (rows := self._graph.forget()) is not None:
             self._fronts.keep(rows)
-        if 2 * len(self._store) < len(self._database) - KEPT_NEWEST:
+        if 2 * len(self._store) < len(self._database) - PASSED:
             self._row = {k: row for row, k in enumerate(self._store.ids)}
             kept = np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids))
             self._database.keep(kept)

@@ -75,7 +75,7 @@ class RecentPlaces:
         rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance_bits, window)
         corner = view.corner[rows_b]
         matches = pair(view, cloud, rows_b[corner], rows_a[corner])
-        start = ransac_pose(matches, rig, rng, PIXEL_SIGMA, config.ransac_iterations)
+        start = ransac_pose(matches, rig, rng, PIXEL_SIGMA)
         if start is None:
             return None
         pose = refine_pose(start, matches, rig, PIXEL_SIGMA)

@@ -74,7 +74,7 @@ def verify(
     if len(rows_b) < max(config.min_match_fraction * len(corners_b), 4):
         return rejection("too_few_matches", len(rows_b))
     matches = pair(view, cloud, rows_b, rows_a)
-    start = ransac_pose(matches, rig, rng, config.sigma_px, config.ransac_iterations)
+    start = ransac_pose(matches, rig, rng, config.sigma_px)
     if start is None:
         return rejection("no_pose")
     agree = int(consistent(start, matches, rig, config.sigma_px).sum())

@@ -16,6 +16,7 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.mapping import map_kernels
+from stereo_sfm.mapping.culling import OF_A_VIEW
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, U8, Bool
@@ -47,7 +48,7 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     pose = map_.keyframes.map_T_kf[alive]
     metres = np.linalg.norm(pose[:, :3, 3] - map_T_kf[:3, 3], axis=1)
     near = np.flatnonzero((metres < reach) & (pose[:, :3, 2] @ map_T_kf[:3, 2] > 0.5))
-    near = alive[near[np.argsort(metres[near], kind="stable")]][: config.near_keyframes]
+    near = alive[near[np.argsort(metres[near], kind="stable")]][: 2 * OF_A_VIEW]
     return np.unique(np.concatenate([first, *second, near]).astype(np.int64))
 
 

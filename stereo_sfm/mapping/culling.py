@@ -12,6 +12,10 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
 OTHERS = 3  # keyframes that observe a point, beyond which one more is redundant
+# Keyframes that stay of those that see the same, in the map and among the loop closer's candidates: they bound memory
+# and time where the robot does not leave a place.
+OF_A_VIEW, OF_EARLIER_VISITS = 5, 300  # of one view; besides, of all views that earlier visits had
+PASSED = 30  # newest keyframes, which are not counted yet: the camera may still be there
 SAME_VIEW_DEPTHS, SAME_VIEW_DEG = 0.15, 15.0  # keyframes of the same view: distance in median depths, angle
 
 
@@ -24,7 +28,7 @@ def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfi
     points = map_.points
     rows = rows[points.alive[rows]]
     lost = points.last_seen[rows] < newest
-    few = lost & (points.obs_count[rows] < config.min_observations)
+    few = lost & (points.obs_count[rows] < 2)
     error, parallax = _quality(map_, rig, rows)
     bad = (error > config.max_error_sigmas) & (points.obs_count[rows] >= 2)
     narrow = lost & (parallax < np.deg2rad(config.min_parallax_deg))
@@ -47,8 +51,8 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
     """A redundant neighbour of the newest keyframe, -1: none.
 
     The oldest one whose points are seen well enough by others; else, in a place that the robot visits often, the one
-    of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes. Of
-    each view one by which places are recognised stays.
+    of several with the same view whose points are seen best by others: a view keeps OF_A_VIEW keyframes. Of each view
+    one by which places are recognised stays.
 
     Args:
         protected: (K,) keyframes that must stay (the first and the newest ones). earlier: see `earlier_visits`.
@@ -62,7 +66,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
         if not _alone_described(map_, row, config):
             return row
     same = np.union1d(neighbours[_same_view(map_, newest, neighbours)], earlier)
-    if len(same) <= config.crowd_keyframes:
+    if len(same) <= OF_A_VIEW:
         return -1
     plain = same[~_described(map_, same)]
     same = plain if len(plain) else same

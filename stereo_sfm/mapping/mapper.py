@@ -73,7 +73,6 @@ FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
 GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
 MOST_AT_ONCE = 40  # keyframes adjusted with a correction of the rig, before all are
 LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
-PASSED = 30  # keyframes after which one that repeats an earlier visit's view is not needed any more
 RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
 
 
@@ -452,13 +451,13 @@ class Mapper:
         self.map.cull_points(weak)
         self._culled.append(weak)
         points = self.map.points
-        self._thin = rows[points.alive[rows] & (points.obs_count[rows] < self._config.min_observations)]
+        self._thin = rows[points.alive[rows] & (points.obs_count[rows] < 2)]
 
     def _cull_loose(self) -> None:
         """Cull the keyframes of earlier times that hardly anything holds."""
         if self._config.redundant_share > 1:
             return
-        settled = np.arange(len(self.map.keyframes)) < len(self.map.keyframes) - PASSED
+        settled = np.arange(len(self.map.keyframes)) < len(self.map.keyframes) - culling.PASSED
         self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
         for row in culling.loose_keyframes(self.map, settled, np.array(self._repeated, int), self._config).tolist():
             self._thin = np.union1d(self._thin, self._seen_by(row))
@@ -472,7 +471,7 @@ class Mapper:
         with it: they have joined points, and carried on from keyframe to keyframe they would follow the robot.
         """
         self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
-        passed = self._repeated[self._config.repeated_keyframes : -PASSED]
+        passed = self._repeated[culling.OF_EARLIER_VISITS : -culling.PASSED]
         return next((row for row in passed if not self._joins_submaps(row)), -1)
 
     def _joins_submaps(self, row: int) -> bool:

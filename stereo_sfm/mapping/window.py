@@ -38,7 +38,6 @@ class Window:
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """The mapper's settings of bundle adjustment."""
     return BundleConfig(
-        rounds=config.rounds,
         iterations=config.iterations,
         huber=config.huber_sigmas,
         cauchy=config.cauchy_medians,

@@ -188,7 +188,7 @@ def adjust(map_: Map, part: window.Window, rigs: Mapping[int, Rig], config: Mapp
     bundle = dataclasses.replace(part.bundle, kf_rig=which)
     result = bundle_adjust(list(number), bundle, window.bundle_config(config))
     window.write_back(map_, part, result)
-    map_.cull_points(part.pt_rows[map_.points.obs_count[part.pt_rows] < config.min_observations])
+    map_.cull_points(part.pt_rows[map_.points.obs_count[part.pt_rows] < 2])
     return result
 
 

@@ -102,10 +102,10 @@ class Relocalizer:
             min_match_fraction=0.0,
             min_inliers=config.relocalize_inliers // 3,  # competing places must be known
             min_inlier_share=0.0,
-            min_cells=config.relocalize_cells,
+            min_cells=config.fewer_cells,
         )
-        side = sideways_config(config)
-        self._side_config = dataclasses.replace(side, min_inliers=config.side_inliers // 2)
+        self._side_inliers = config.side_inliers
+        self._side_config = dataclasses.replace(sideways_config(config), min_inliers=self._side_inliers // 2)
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
@@ -212,7 +212,7 @@ class Relocalizer:
 
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
-        return ahead.confident or ahead.others < 0 or ahead.others >= self._config.side_inliers
+        return ahead.confident or ahead.others < 0 or ahead.others >= self._side_inliers
 
     def _row(self, place: Location) -> int:
         """Of the keyframe that a location was found with."""
@@ -328,7 +328,7 @@ class Relocalizer:
 
     def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
         """The location of a verification; `share`: of the camera's corners, required but from another direction."""
-        least = SIDE_FACTOR * self._config.side_inliers if sideways else self._config.relocalize_inliers
+        least = SIDE_FACTOR * self._side_inliers if sideways else self._config.relocalize_inliers
         share = 0.0 if sideways else share
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
         kf_id = int(self._map.kf_ids[row])
