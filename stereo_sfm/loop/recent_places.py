@@ -79,7 +79,7 @@ class RecentPlaces:
         if start is None:
             return None
         pose = refine_pose(start, matches, rig, PIXEL_SIGMA)
-        enough = pose.inlier.sum() >= max(MIN_INLIERS, MIN_INLIER_SHARE * len(matches))
+        enough = pose.inlier.sum() >= max(MIN_INLIERS, MIN_INLIER_SHARE * matches.size)
         return pose.b_T_a if enough else None
 
     def _order(self, expected: F64) -> list[Keyframe]:

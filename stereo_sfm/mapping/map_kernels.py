@@ -247,15 +247,14 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
 
 
 @njit
-def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_right):
+def predict(xyz, anchors, map_T_kf, kf_T_map, cameras, uv_left, uv_right):
     """Fills uv_left and uv_right (N, 2) with the predicted pixels of points in a keyframe; NaN where not recognisable.
 
     Args:
         xyz: (N, 3) in the map. anchors: (N, 3) where the keyframes stood that saw them first: from less than half or
             more than twice that distance, or a direction whose cosine to that one is below 0.8, they look otherwise.
-        cams: (left model, left params, right model, right params).
+        cameras: StereoCameras.
     """
-    left_model, left_params, right_model, right_params = cams
     for i in range(xyz.shape[0]):
         uv_left[i, 0] = uv_left[i, 1] = uv_right[i, 0] = uv_right[i, 1] = math.nan
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
@@ -265,9 +264,9 @@ def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_ri
         if now >= 4.0 * then or then >= 4.0 * now or a0 * b0 + a1 * b1 + a2 * b2 <= 0.8 * math.sqrt(then * now):
             continue
         p0, p1, p2 = transform_point(kf_T_map, x, y, z)
-        uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(left_model, left_params, p0, p1, p2)
-        p0, p1, p2 = transform_point(right_T_left, p0, p1, p2)
-        uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(right_model, right_params, p0, p1, p2)
+        uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(cameras.model_l, cameras.params_l, p0, p1, p2)
+        p0, p1, p2 = transform_point(cameras.right_T_left, p0, p1, p2)
+        uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(cameras.model_r, cameras.params_r, p0, p1, p2)
 
 
 @njit

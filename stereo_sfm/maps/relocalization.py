@@ -196,7 +196,7 @@ class Relocalizer:
         """The pose from all that agrees with it ahead and beside, as the nearest keyframe of the map sees it."""
         row = int(self._nearest(place.map_T_cam, 1)[0])
         together = joined([self._matches(keyframe, place.map_T_cam, row, sideways) for sideways in (False, True)])
-        if len(together) < self._config.min_inliers:
+        if together.size < self._config.min_inliers:
             return place
         b_T_a = se3.inverse(place.map_T_cam) @ self._map.map_T_kf[row]
         pose = refine_pose(b_T_a, together, self._rig, self._config.sigma_px)
