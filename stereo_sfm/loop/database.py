@@ -140,7 +140,7 @@ class PlaceDatabase:
         return sum(array.nbytes for array in (*self._postings, self._kf_ids))
 
     def scores(self, bag: Bag) -> F64:
-        """(K,) L1 score of every keyframe in order of insertion (see `vocabulary.score`)."""
+        """(K,) L1 score in [0, 1] of every keyframe in order of insertion: 1 - |a - b|_1 / 2, the common minima."""
         scores = np.zeros(self._count)
         _accumulate(bag.words, bag.weights, self._postings, scores)
         return scores

@@ -22,8 +22,7 @@ MIN_SPEED = 0.5  # metres a second, lower bound of that speed
 SPEED_NS = 1_000_000_000  # time before a gap over which it is measured
 KNOWN_PATHS = 4096  # that are remembered
 FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
-NEWEST_KEYFRAMES, NEWEST_LOOPS = 128, 256  # that stay, candidates or not
-BETWEEN_CHAINS = 64  # newest loops between two chains that stay
+NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two chains half
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
@@ -124,8 +123,8 @@ class KeyframeGraph:
             return None
         a, b = loops.ends.T
         needed = (nodes.kept[a] & nodes.kept[b]) | _newest_between(nodes.chain[a], nodes.chain[b])
-        needed |= np.arange(len(loops)) >= len(loops) - NEWEST_LOOPS
-        stay = nodes.kept | (np.arange(count) >= count - NEWEST_KEYFRAMES)
+        needed |= np.arange(len(loops)) >= len(loops) - 2 * NEWEST
+        stay = nodes.kept | (np.arange(count) >= count - NEWEST)
         stay[loops.ends[needed].ravel()] = True
         for row in np.flatnonzero(nodes.chain[1:] != nodes.chain[:-1]).tolist():
             stay[max(row + 1 - AROUND_A_GAP, 0) : row + 2] = True
@@ -264,7 +263,7 @@ def _newest_between(a: I64, b: I64) -> Bool:
     order = np.argsort(pair, kind="stable")
     later = np.empty(len(a), np.int64)  # loops between the same two that came later
     later[order] = np.cumsum(np.bincount(pair))[pair[order]] - 1 - np.arange(len(a))
-    return (a != b) & (later < BETWEEN_CHAINS)
+    return (a != b) & (later < NEWEST // 2)
 
 
 def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:

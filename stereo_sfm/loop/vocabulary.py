@@ -67,12 +67,6 @@ class Vocabulary:
         return Bag(words[keep].astype(np.int32), (weights[keep] / max(total, 1e-12)).astype(np.float32))
 
 
-def score(a: Bag, b: Bag) -> float:
-    """L1 score in [0, 1]: 1 - |a - b|_1 / 2, which for positive weights is the sum of the common minima."""
-    _, ia, ib = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
-    return float(np.minimum(a.weights[ia], b.weights[ib]).sum())
-
-
 def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int = 0) -> Vocabulary:
     """Hierarchical k-majority clustering of all descriptors, then idf over the images.
 

@@ -11,13 +11,12 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.geometry.small_matrix import solve_symmetric
+from stereo_sfm.mapping.bundle import BundleConfig
 from stereo_sfm.mapping.bundle_kernels import Rows, linearize, pose_blocks
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, Bool
 
-ROUNDS, ITERATIONS = 3, 10
-OUTLIER_CHI2 = 9.21  # squared normalised residual of one image above which it is an outlier (99 % of 2 dof)
-DAMPING, TOLERANCE = 1e-4, 1e-5
+SETTINGS = BundleConfig(rounds=3)
 
 
 @njit
@@ -33,18 +32,19 @@ def _model(pose, points, rows, use, limit, cameras, huber, lin):
 
 
 @njit
-def _descend(pose, points, rows, use, cameras, huber, rounds, iterations, lin, other):
+def _descend(pose, points, rows, use, cameras, settings, lin, other):
     """Levenberg-Marquardt on pose (4, 4), in place, without outliers from the second round on.
 
     Returns:
         (M, 2) squared normalised residuals in the end.
     """
+    huber, rounds, iterations, outlier_chi2, first_damping, tolerance = settings
     free, delta, trial = np.zeros(1, np.int64), np.zeros((4, 4)), np.zeros((4, 4))
     h, b, xi, factor = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros(6), np.zeros((6, 6))
     for index in range(rounds):
-        limit = OUTLIER_CHI2 if index > 0 else 0.0
+        limit = outlier_chi2 if index > 0 else 0.0
         cost = _model(pose, points, rows, use, limit, cameras, huber, lin)
-        damping, accepted = DAMPING, 0
+        damping, accepted = first_damping, 0
         while accepted < iterations:
             for i in range(6):
                 b[0, i] = 0.0
@@ -60,10 +60,10 @@ def _descend(pose, points, rows, use, cameras, huber, rounds, iterations, lin, o
             new = _model(trial, points, rows, use, 0.0, cameras, huber, other)
             if not new <= cost:
                 damping *= 10.0
-                if damping > 1e6 or new - cost <= 0.1 * TOLERANCE * cost:
+                if damping > 1e6 or new - cost <= 0.1 * tolerance * cost:
                     break
                 continue
-            done = cost - new <= TOLERANCE * cost
+            done = cost - new <= tolerance * cost
             cost, damping, accepted = new, max(0.1 * damping, 1e-9), accepted + 1
             lin, other = other, lin
             for i in range(3):
@@ -86,7 +86,7 @@ def adjust_pose(
     Returns:
         (4, 4) pose, and (N, 2) which observations agree with it, in the left and the right image.
     """
-    count, pose = len(points), np.array(world_T_cam, float)
+    count, pose, s = len(points), np.array(world_T_cam, float), SETTINGS
     seen = np.stack([np.isfinite(uv_left).all(1), np.isfinite(uv_right[:, 0]) & rig.stereo], 1)
     weights = np.where(seen, 1.0 / np.asarray(sigma, float)[:, None], 0.0)
     uv = np.ascontiguousarray(uv_left, float), np.ascontiguousarray(uv_right, float)
@@ -96,6 +96,6 @@ def adjust_pose(
     )
     chi2 = _descend(
         *(pose, np.ascontiguousarray(points, float), rows, seen.copy(), StereoCameras.of_any(rig)),
-        *(float(huber), ROUNDS, ITERATIONS, lin, other),
+        *((float(huber), s.rounds, s.iterations, s.outlier_chi2, s.damping, s.tolerance), lin, other),
     )
-    return se3.orthonormalize(pose), seen & (chi2 <= OUTLIER_CHI2)
+    return se3.orthonormalize(pose), seen & (chi2 <= s.outlier_chi2)

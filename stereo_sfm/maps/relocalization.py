@@ -17,7 +17,7 @@ from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.other_camera import widest
-from stereo_sfm.loop.place_view import PlaceView, place_view_of
+from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
     MIN_CORNERS,
     SIDE_FACTOR,
@@ -27,20 +27,17 @@ from stereo_sfm.loop.sideways import (
     sideways_config,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import Verdict, pair, verify, verify_near, within
+from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
-CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
-CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
 SIDE_PLACES = 12  # of `relocalize_candidates` that are verified beside: no confident one ends that search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
-KEPT = 64  # newest clouds: a place found ahead is a candidate beside, and cameras ask from near where they were
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ class Relocalizer:
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
         self._sees = self._seen.tocsc()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
-        self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)
+        self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)  # cameras ask from near where they were
         self._vocabularies: list[Vocabulary] = []  # ahead and beside, with the idf of this map
         self._databases: list[PlaceDatabase] = []
         for corners in ([k.corners for k in self._keyframes], [k.sides for k in self._keyframes]):
@@ -327,14 +324,15 @@ class Relocalizer:
         return rows[np.argsort(metres + radians, kind="stable")[:count]]
 
     def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
-        """The location of a verification; `share`: of the camera's corners, required but from another direction."""
+        """The location of a verification, confident with twice what is required.
+
+        `share`: of the camera's corners, required but from another direction.
+        """
         least = SIDE_FACTOR * self._side_inliers if sideways else self._config.relocalize_inliers
         share = 0.0 if sideways else share
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
         kf_id = int(self._map.kf_ids[row])
-        enough, confident = (
-            verdict.inliers >= times * least and verdict.share >= times * share for times in (1.0, CONFIDENCE_FACTOR)
-        )
+        enough, confident = (verdict.inliers >= times * least and verdict.share >= times * share for times in (1, 2))
         reason = "" if enough else "too_few_inliers"
         return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)
 

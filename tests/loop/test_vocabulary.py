@@ -119,7 +119,7 @@ def test_matching_finds_the_true_pairs_and_the_ratio_test_ignores_views_of_one_p
     rng = np.random.default_rng(7)
     which = np.arange(100)
     query, train = picture(rng, which), picture(rng, np.repeat(which, 2))
-    q, t, _ = match_descriptors(query, train, np.repeat(which, 2), ratio=0.8)
+    q, t = match_descriptors(query, train, np.repeat(which, 2), ratio=0.8)
     assert len(q) > 95
     assert (t // 2 == q).all()
     assert len(match_descriptors(query, train, None, ratio=0.8)[0]) < 60  # each view is the other's rival
