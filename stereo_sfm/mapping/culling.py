@@ -41,8 +41,8 @@ def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
     table, points, pose = map_.observations, map_.points, map_.keyframes.map_T_kf
     out = np.empty((len(rows), 2))
     map_kernels.judge_points(
-        rows, points.head, table.following, table.kf, table.uv_left, table.uv_right, table.sigma, pose[:, :3, :3],
-        pose[:, :3, 3], points.xyz, rig.left.model_id, rig.left.params, rig.baseline, out,
+        rows, map_.lists, table.uv_left, table.uv_right, table.sigma, pose[:, :3, :3], pose[:, :3, 3], points.xyz,
+        rig.left.model_id, rig.left.params, rig.baseline, out,
     )  # fmt: skip
     return out[:, 0], out[:, 1]
 
@@ -134,7 +134,7 @@ def _seen_by_others(map_: Map, rows: I64) -> F64:
 def _same_view(map_: Map, newest: int, rows: I64) -> Bool:
     """(N,) which keyframes have about the pose of the newest."""
     poses = map_.keyframes.map_T_kf
-    pts = map_.observations.pt[map_.observations_of_keyframe(newest)]
+    pts = map_.seen_by(newest)
     depth = np.nanmedian(np.linalg.norm(map_.points.xyz[pts] - poses[newest, :3, 3], axis=1)) if len(pts) else 0.0
     metres, radians = se3.extent(se3.inverse(poses[rows]) @ poses[newest])
     return (metres < SAME_VIEW_DEPTHS * depth) & (radians < np.deg2rad(SAME_VIEW_DEG))
