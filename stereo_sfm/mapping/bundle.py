@@ -18,6 +18,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
+from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping import bundle_kernels as kernels
 from stereo_sfm.mapping.level import Level
 from stereo_sfm.mapping.motion_factors import MotionFactors, MotionModel
@@ -67,6 +68,7 @@ class Bundle:
     level: Level | None = None  # what the keyframes measured of gravity; None: nothing
     motions: MotionFactors | None = None  # what IMU and wheels measured between them; None: nothing
     kf_rig: I64 | None = None  # (K,) which of several rigs took a keyframe; None: there is one
+    points_stay: bool = False  # only poses are adjusted
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +182,7 @@ class _Solver:
         self.fixed = _Table(rigs, bundle, config, np.flatnonzero(~moves))
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
+        self.points_stay = bundle.points_stay
         self.level = bundle.level
         self.motions = bundle.motions
         self.model: MotionModel | None = None  # of the round
@@ -254,8 +257,11 @@ class _Solver:
         diagonal += damping * diagonal + 1e-12
         return h, b
 
-    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64]) -> F64 | None:
+    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64] | None) -> F64 | None:
         h, b = self._pose_system(state, damping)
+        if blocks is None:  # nothing couples the poses
+            xi, factor = np.zeros(b.shape), np.zeros((6, 6))
+            return xi if all(solve_symmetric(h[k], b[k], xi[k], factor) for k in range(len(h))) else None
         table = self.table
         if self.system is None:
             dense = self.config.dense if self.model is None else True  # which motions couple as well
@@ -280,7 +286,7 @@ class _Solver:
     def step(self, state: _State, damping: float) -> _State | None:
         """The state after one damped step, or None if the system has no solution."""
         rot, pos, points = state.rot, state.pos, state.points
-        blocks = self._point_blocks(state, damping)
+        blocks = None if self.points_stay else self._point_blocks(state, damping)
         xi = np.zeros((0, 6))
         if len(self.moving):
             solved = self._solve_poses(state, damping, blocks)
@@ -288,8 +294,10 @@ class _Solver:
                 return None
             xi, rot, pos = solved, rot.copy(), pos.copy()
             kernels.move_poses(self.moving, xi, rot, pos)
-        points, table = np.empty_like(points), self.table
-        kernels.point_steps(table.starts, table.kf, self.free, state.rot, state.lin, *blocks, xi, state.points, points)
+        if blocks is not None:
+            points, table = np.empty_like(points), self.table
+            view = table.starts, table.kf, self.free, state.rot, state.lin
+            kernels.point_steps(*view, *blocks, xi, state.points, points)
         return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
     def _extended(self, state: _State, trial: _State) -> _State:
