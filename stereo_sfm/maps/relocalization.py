@@ -88,13 +88,13 @@ class Relocalizer:
         """Args:
         rig: of the camera. map_rigs: of each keyframe of the map, the same object for equal ones; none: the camera's.
         """
-        self._map, self._own, self._camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
+        self.map, self._own, self.camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
         self._rig = widest([rig, *dict.fromkeys(self._own)])  # whose pixels are compared
         self._keyframes = snapshot.keyframes()
         self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
-        self._config = dataclasses.replace(
+        self.config = dataclasses.replace(
             config,
             min_match_fraction=0.0,
             min_inliers=config.relocalize_inliers // 3,  # competing places must be known
@@ -125,7 +125,7 @@ class Relocalizer:
 
     def use(self, camera: Rig) -> None:
         """Use a corrected rig of the camera."""
-        self._camera = camera
+        self.camera = camera
         self._rig = widest([camera, *dict.fromkeys(self._own)])
         self._cloud.cache_clear()
 
@@ -193,11 +193,11 @@ class Relocalizer:
         """The pose from all that agrees with it ahead and beside, as the nearest keyframe of the map sees it."""
         row = int(self._nearest(place.map_T_cam, 1)[0])
         together = joined([self._matches(keyframe, place.map_T_cam, row, sideways) for sideways in (False, True)])
-        if together.size < self._config.min_inliers:
+        if together.size < self.config.min_inliers:
             return place
-        b_T_a = se3.inverse(place.map_T_cam) @ self._map.map_T_kf[row]
-        pose = refine_pose(b_T_a, together, self._rig, self._config.sigma_px)
-        map_T_cam = self._map.map_T_kf[row] @ se3.inverse(pose.b_T_a)
+        b_T_a = se3.inverse(place.map_T_cam) @ self.map.map_T_kf[row]
+        pose = refine_pose(b_T_a, together, self._rig, self.config.sigma_px)
+        map_T_cam = self.map.map_T_kf[row] @ se3.inverse(pose.b_T_a)
         if not within(se3.inverse(place.map_T_cam) @ map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG):
             return place
         return dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
@@ -213,11 +213,11 @@ class Relocalizer:
 
     def _row(self, place: Location) -> int:
         """Of the keyframe that a location was found with."""
-        return int(np.searchsorted(self._map.kf_ids, place.kf_id))
+        return int(np.searchsorted(self.map.kf_ids, place.kf_id))
 
     def _is_turned(self, place: Location) -> bool:
         """Whether the camera looks another way than the keyframe, so that only views to the side can be compared."""
-        kf_T_cam = se3.inverse(self._map.map_T_kf[self._row(place)]) @ place.map_T_cam
+        kf_T_cam = se3.inverse(self.map.map_T_kf[self._row(place)]) @ place.map_T_cam
         return bool(kf_T_cam[2, 2] < TURNED)
 
     def _with_ahead(self, keyframe: Keyframe, beside: Location) -> Location:
@@ -260,7 +260,7 @@ class Relocalizer:
         ahead = self._search_near(keyframe, guess, int(self._nearest(guess, 1)[0]), False)
         if ahead.found or len(keyframe.sides) < MIN_CORNERS:
             return ahead
-        rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self._map.map_T_kf)
+        rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self.map.map_T_kf)
         beside = self._search_near(keyframe, guess, rows[0], True) if len(rows) else ahead
         return beside if beside.found else ahead
 
@@ -272,27 +272,27 @@ class Relocalizer:
 
     def _verify_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Verdict:
         """Match a keyframe with a row's cloud around a predicted map_T_cam (4, 4)."""
-        kf_T_cam, view = se3.inverse(guess) @ self._map.map_T_kf[row], self._view(keyframe, sideways)
+        kf_T_cam, view = se3.inverse(guess) @ self.map.map_T_kf[row], self._view(keyframe, sideways)
         return verify_near(kf_T_cam, view, self._cloud(row, sideways), self._rig, self._config_of(sideways))
 
     def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
-        return place_view_of(keyframe, self._rig, self._config.disparity_sigma_px, sideways, self._camera)
+        return place_view_of(keyframe, self._rig, self.config.disparity_sigma_px, sideways, self.camera)
 
     def _config_of(self, sideways: bool) -> LoopConfig:
-        return self._side_config if sideways else self._config
+        return self._side_config if sideways else self.config
 
     def _gather(self, row: int, sideways: bool) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
         shared = self._shared(row)
         shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
-        order = np.argsort(-shared, kind="stable")[: self._config.relocalize_keyframes]
+        order = np.argsort(-shared, kind="stable")[: self.config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
         own = [self._own[k] for k in order.tolist()]
-        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways, own)
+        cloud = gather(centre, others, self._rig, self.config.disparity_sigma_px, sideways, own)
         mapped = cloud.ids >= 0
-        at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
+        at = np.searchsorted(self.map.pt_ids, cloud.ids[mapped])
         sigmas = cloud.sigmas.copy()
         sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA_M)
         return dataclasses.replace(cloud, sigmas=sigmas)
@@ -311,7 +311,7 @@ class Relocalizer:
         together[self._described] = with_neighbours(scores[self._described])
         chosen: list[int] = []
         for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
-            if len(chosen) == self._config.relocalize_candidates or scores[row] <= 0:
+            if len(chosen) == self.config.relocalize_candidates or scores[row] <= 0:
                 break
             if all(abs(row - other) > 2 for other in chosen):
                 chosen.append(row)
@@ -320,7 +320,7 @@ class Relocalizer:
     def _nearest(self, guess: F64, count: int) -> I64:
         """Rows of the nearest keyframes, nearest first."""
         rows = self._described if len(self._described) else np.arange(len(self._keyframes))
-        metres, radians = se3.extent(se3.inverse(self._map.map_T_kf[rows]) @ guess)
+        metres, radians = se3.extent(se3.inverse(self.map.map_T_kf[rows]) @ guess)
         return rows[np.argsort(metres + radians, kind="stable")[:count]]
 
     def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
@@ -328,10 +328,10 @@ class Relocalizer:
 
         `share`: of the camera's corners, required but from another direction.
         """
-        least = SIDE_FACTOR * self._side_inliers if sideways else self._config.relocalize_inliers
+        least = SIDE_FACTOR * self._side_inliers if sideways else self.config.relocalize_inliers
         share = 0.0 if sideways else share
-        map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
-        kf_id = int(self._map.kf_ids[row])
+        map_T_cam = self.map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
+        kf_id = int(self.map.kf_ids[row])
         enough, confident = (verdict.inliers >= times * least and verdict.share >= times * share for times in (1, 2))
         reason = "" if enough else "too_few_inliers"
         return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)
