@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import dijkstra
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Bool
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views
@@ -48,34 +47,21 @@ class GapMotion:
 class _Nodes(Columns):
     """One row for each keyframe."""
 
-    kf_id: I64  # ascending
-    stamp_ns: I64
-    chain: I64  # number of the uninterrupted part of the odometry
-    odom_T_cam: F64  # (K, 4, 4)
-    anchored: F64  # (K, 4, 4) the same, corrected at each loop to the pose of its older end
-    frame: I64  # the chain whose frame `anchored` is in
-    distance: F64  # metres since the start
-    kept: Bool  # False: no longer a candidate
-
-    SPEC: ClassVar[Spec] = {
-        "kf_id": (np.int64, (), -1),
-        "stamp_ns": (np.int64, (), 0),
-        "chain": (np.int64, (), 0),
-        "odom_T_cam": (np.float64, (4, 4), np.eye(4)),
-        "anchored": (np.float64, (4, 4), np.eye(4)),
-        "frame": (np.int64, (), 0),
-        "distance": (np.float64, (), 0.0),
-        "kept": (np.bool_, (), True),
-    }
+    kf_id: I64 = column(np.int64, -1)  # ascending
+    stamp_ns: I64 = column(np.int64, 0)
+    chain: I64 = column(np.int64, 0)  # number of the uninterrupted part of the odometry
+    odom_T_cam: F64 = column(np.float64, np.eye(4), (4, 4))  # (K, 4, 4)
+    anchored: F64 = column(np.float64, np.eye(4), (4, 4))  # corrected at each loop to the pose of its older end
+    frame: I64 = column(np.int64, 0)  # the chain whose frame `anchored` is in
+    distance: F64 = column(np.float64, 0.0)  # metres since the start
+    kept: Bool = column(np.bool_, True)  # False: no longer a candidate
 
 
 class _Loops(Columns):
     """One row for each accepted loop."""
 
-    ends: I64  # (L, 2) rows of the keyframes a and b
-    a_T_b: F64  # (L, 4, 4)
-
-    SPEC: ClassVar[Spec] = {"ends": (np.int64, (2,), -1), "a_T_b": (np.float64, (4, 4), np.eye(4))}
+    ends: I64 = column(np.int64, -1, (2,))  # (L, 2) rows of the keyframes a and b
+    a_T_b: F64 = column(np.float64, np.eye(4), (4, 4))  # (L, 4, 4)
 
 
 class KeyframeGraph:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from stereo_sfm.mapping import map_kernels
-from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.types import I32, I64, Keyframe
 
@@ -15,20 +13,16 @@ from stereo_sfm.types import I32, I64, Keyframe
 class _Sightings(Columns):
     """One row for each point of each keyframe; those of a point are a linked list, as in the map."""
 
-    kf: I32  # its number, see `KeyframeStore`
-    point: I32  # row of the point, -1: removed
-    following: I32  # next older row of the same point, -1: last
-
-    SPEC: ClassVar[Spec] = {"kf": (np.int32, (), -1), "point": (np.int32, (), -1), "following": (np.int32, (), -1)}
+    kf: I32 = column(np.int32, -1)  # its number, see `KeyframeStore`
+    point: I32 = column(np.int32, -1)  # row of the point, -1: removed
+    following: I32 = column(np.int32, -1)  # next older row of the same point, -1: last
 
 
 class _Points(Columns):
     """One row for each point."""
 
-    head: I32  # newest sighting, -1: none
-    merged_into: I32  # row of the same physical point, -1: none
-
-    SPEC: ClassVar[Spec] = {"head": (np.int32, (), -1), "merged_into": (np.int32, (), -1)}
+    head: I32 = column(np.int32, -1)  # newest sighting, -1: none
+    merged_into: I32 = column(np.int32, -1)  # row of the same physical point, -1: none
 
 
 class KeyframeStore:

@@ -8,18 +8,24 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
-
-
 SPARE = 4  # one spare row for so many in use: rows are copied four times on the way, and little memory is unused
 
 
+def column(dtype: DTypeLike, default: Any, shape: tuple[int, ...] = ()) -> Any:
+    """A column of a table: numbers of a type, the value of a new row, the shape of one value."""
+    return dtype, shape, default
+
+
 class Columns:
-    """Rows in arrays. A subclass names its columns in SPEC, (dtype, shape of one value, value of a new row).
+    """Rows in arrays. A subclass names its columns, each as an attribute that is a `column`.
 
     `table.name` is a view (rows, ...) of the column that may be written to; it is valid until rows are appended.
     """
 
     SPEC: ClassVar[Spec] = {}
+
+    def __init_subclass__(cls) -> None:
+        cls.SPEC = {name: value for name, value in vars(cls).items() if isinstance(value, tuple)}
 
     def __init__(self, capacity: int = 64) -> None:
         self._count = 0
