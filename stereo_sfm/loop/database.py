@@ -125,7 +125,7 @@ class PlaceDatabase:
         to._used = used = _copy_kept(self._postings, renamed, to._postings)
         to._kf_ids, to._count = np.append(self.kf_ids[rows], np.zeros(64, np.int64)), len(rows)
         head, *blocks = to._postings
-        to._postings = Postings(head, *(column[:used].copy() for column in blocks))
+        to._postings = Postings._make((head, *(column[:used].copy() for column in blocks)))
         self.__dict__ = to.__dict__
 
     def _reserve(self, blocks: int) -> None:

@@ -116,7 +116,7 @@ class _Table:
         self._weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
         columns = kernels.Rows(self.kf, self.pt, left, right, self._weights)
         self._rigs = [  # of each: its rows, and their columns
-            (own, kernels.Rows(*(column[own] for column in columns)), StereoCameras.of_any(rig))
+            (own, kernels.Rows._make(column[own] for column in columns), StereoCameras.of_any(rig))
             for rig, own in zip(rigs, of_rig, strict=True)
         ]
         self.trust = np.ones(len(bundle.points))  # (P,) factor of the loss of the points' disparities

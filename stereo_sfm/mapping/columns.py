@@ -22,14 +22,14 @@ class Columns:
     `table.name` is a view (rows, ...) of the column that may be written to; it is valid until rows are appended.
     """
 
-    SPEC: ClassVar[Spec] = {}
+    spec: ClassVar[Spec] = {}
 
     def __init_subclass__(cls) -> None:
-        cls.SPEC = {name: value for name, value in vars(cls).items() if isinstance(value, tuple)}
+        cls.spec = {name: value for name, value in vars(cls).items() if isinstance(value, tuple)}
 
     def __init__(self, capacity: int = 64) -> None:
         self._count = 0
-        self._data = {name: np.empty((capacity, *shape), dtype) for name, (dtype, shape, _) in self.SPEC.items()}
+        self._data = {name: np.empty((capacity, *shape), dtype) for name, (dtype, shape, _) in self.spec.items()}
         self._show()
 
     def __len__(self) -> int:
@@ -47,7 +47,7 @@ class Columns:
                 grown = np.empty((max(last, first + first // SPARE, 64), *data.shape[1:]), data.dtype)
                 grown[:first] = data[:first]
                 self._data[name] = data = grown
-            data[first:last] = values.pop(name) if name in values else self.SPEC[name][2]
+            data[first:last] = values.pop(name) if name in values else self.spec[name][2]
         if values:
             raise TypeError(f"no such columns: {', '.join(values)}")
         self._count = last

@@ -268,7 +268,7 @@ class Map:
     def _move_to_end(self, kf: int) -> None:
         """Move the observations of a keyframe to the end of the table, where more can follow."""
         table, rows = self.observations, self.observations_of_keyframe(kf)
-        columns = {name: getattr(table, name)[rows] for name in table.SPEC if name != "following"}
+        columns = {name: getattr(table, name)[rows] for name in table.spec if name != "following"}
         standing = self.points.descriptor_obs[columns["pt"]] == rows
         map_kernels.unlink(rows, self.lists)
         made = table.append(len(rows), **columns)

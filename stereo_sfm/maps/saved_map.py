@@ -243,8 +243,8 @@ def joined(maps: list[SavedMap]) -> SavedMap:
     parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
     sessions: list[Any] = []
     cameras: dict[int, MapCamera] = {}
-    ids = dict.fromkeys(("kf_ids", "pt_ids", "submap_ids"), 0)  # the first of this map
-    rows = dict.fromkeys(("", "keyframes", "points"), 0)
+    ids: dict[str, int] = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0}  # the first of this map
+    rows: dict[str, int] = {"": 0, "keyframes": 0, "points": 0}
     next_session = 0
     for saved in maps:
         if saved.rig.stereo != first.rig.stereo:
