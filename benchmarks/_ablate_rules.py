@@ -322,7 +322,7 @@ RULES = (
     _rule(
         "support across a gap",
         CLOSER,
-        "enough = loop.votes == 1 or loop.sideways or _total(support) >= MIN_SUPPORT",
+        "enough = loop.votes == 1 or loop.sideways or self._total(support) >= 2 * (CONFIDENT_SHARE - self._chance)",
         "enough = True",
     ),
     _rule("a better loop elsewhere", CLOSER, "if loop.inliers < RIVAL * best_inliers:", "if False:"),

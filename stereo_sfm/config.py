@@ -31,16 +31,44 @@ RENAMED = {
     "mapper.match_distance": "mapper.match_distance_bits",
     "loop.max_distance": "loop.max_distance_bits",
     "loop.pixel_sigma": "loop.sigma_px",
-    "loop.disparity_sigma": "loop.disparity_sigma_px",
-    "loop.unknown_way_share": "loop.min_inlier_share_after_gap",
     "loop.gate_metres": "loop.gate_m",
-    "loop.gate_per_metre": "loop.gate_m_per_m",
     "loop.gate_degrees": "loop.gate_deg",
-    "loop.gate_degrees_per_metre": "loop.gate_deg_per_m",
 }
 
 # Settings of earlier versions that decide nothing any more -> what does.
-REMOVED = {"tracker.max_window_disparity_px": "tracker.max_window_difference_sigmas"}
+REMOVED = {
+    "tracker.max_window_disparity_px": "tracker.max_window_difference_sigmas decides",
+    "tracker.depth_sigma_px": "it is ten times tracker.sigma_px",
+    "features.motion_window_deg": "matches may move by any angle",
+    "odometry.unit_step_m": "a step of unknown length is one metre long",
+    "odometry.keyframe_rescue_inliers": "it is three quarters of odometry.keyframe_min_inliers",
+    "odometry.init_epipolar_px": "it is twice odometry.epipolar_px",
+    "odometry.init_parallax_deg": "it is one degree",
+    "manhattan.gate_deg": "it is twenty times manhattan.model_sigma_deg",
+    "mapper.disparity_sigmas": "it is twice mapper.huber_sigmas",
+    "mapper.rounds": "there are two",
+    "mapper.match_sigma_px": "it is 2.5 times mapper.sigma_px",
+    "mapper.near_keyframes": "there are as many as two views keep",
+    "mapper.near_depths": "it is twice what keyframes of one view are apart",
+    "mapper.min_observations": "a point needs two keyframes",
+    "mapper.crowd_keyframes": "a view keeps five keyframes",
+    "mapper.repeated_keyframes": "300 keyframes of earlier visits are kept besides",
+    "loop.grow_every": "the vocabulary does not change while it is used",
+    "loop.connected_points": "it is half of loop.min_inliers",
+    "loop.side_inliers": "it is 1.5 times loop.min_inliers",
+    "loop.side_cells": "it is three quarters of loop.min_cells",
+    "loop.relocalize_cells": "it is three quarters of loop.min_cells",
+    "loop.disparity_sigma": "it is half of loop.sigma_px",
+    "loop.disparity_sigma_px": "it is half of loop.sigma_px",
+    "loop.ransac_iterations": "there are 400",
+    "loop.consistent_window": "it is twice loop.consistent",
+    "loop.unknown_way_share": "it is twice loop.min_inlier_share",
+    "loop.min_inlier_share_after_gap": "it is twice loop.min_inlier_share",
+    "loop.gate_per_metre": "loop.gate_m doubles in 30 m",
+    "loop.gate_m_per_m": "loop.gate_m doubles in 30 m",
+    "loop.gate_degrees_per_metre": "loop.gate_deg doubles in 10 m",
+    "loop.gate_deg_per_m": "loop.gate_deg doubles in 10 m",
+}
 
 
 def estimator_names() -> tuple[str, ...]:
@@ -65,9 +93,6 @@ class TrackerConfig:
     corner_quality: float = number(0.005, 0, 1, "Least corner response, as a share of the strong ones in the image")
     min_depth_baselines: float = number(4.0, 0.1, 1000, "Nearest stereo match that is searched, in baselines")
     sigma_px: float = number(0.3, 0.001, 100, "Noise of one coordinate of an observation at the start of a run")
-    depth_sigma_px: float = number(
-        3.0, 0.001, 1000, "Noise of an observation that refines a depth; errors of successive frames are correlated"
-    )
     max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is an outlier")
     max_epipolar_px: float = number(
         1.0,
@@ -98,6 +123,11 @@ class TrackerConfig:
         1.0, 0.0, 1e5, "Seconds without a pose after which a new submap begins, whichever the tracker"
     )
 
+    @property
+    def depth_sigma_px(self) -> float:
+        """Noise of an observation that refines a depth: as if a hundred successive frames showed the same error."""
+        return 10.0 * self.sigma_px
+
 
 @dataclass(frozen=True)
 class FeaturesConfig:
@@ -115,9 +145,6 @@ class FeaturesConfig:
     epipolar_px: float = number(1.5, 0.01, 1000, "Largest distance to the epipolar line, in pixels at the image centre")
     stereo_only: bool = switch(True, "With two cameras, use only points seen by both (as the thesis)")
     motion_check: bool = switch(False, "Fundamental RANSAC on matches between frames before the estimator's own")
-    motion_window_deg: float = number(
-        0.0, 0, 360, "Matches that moved by more than this angle between frames are dropped; 0: none"
-    )
 
 
 @dataclass(frozen=True)
@@ -138,16 +165,19 @@ class OdometryConfig:
     max_samples: int = number(512, 1, 1_000_000, "RANSAC hypotheses")
     min_inliers: int = number(8, 1, 100_000, "Inliers below which a frame is lost")
     scale: str = word("stereo", ("stereo", "unit", "ground-truth"), "Scale of translations without metric points")
-    unit_step_m: float = number(1.0, 1e-9, 1e6, 'Length of one step with scale "unit"')
     keyframe_ratio: float = number(0.3, 0, 1, "New keyframe when a smaller share of the last one's points is tracked")
     keyframe_frames: int = number(30, 0, 100_000, "Frames that a keyframe represents at most; 0: no limit")
     keyframe_min_frames: int = number(0, 0, 100_000, "Frames that a keyframe represents at least")
-    keyframe_min_inliers: int = number(0, 0, 100_000, "New keyframe below this many inliers; 0: the ratio decides")
-    keyframe_rescue_inliers: int = number(0, 0, 100_000, "New keyframe at once below this many inliers")
+    keyframe_min_inliers: int = number(
+        0, 0, 100_000, "New keyframe below this many inliers, at once below three quarters; 0: the ratio decides"
+    )
     monocular: bool = switch(False, "Use the left camera alone, whatever the source has (pnp)")
     init_share: float = number(0.9, 0, 1, "Monocular start: share of the matches that must fit the essential matrix")
-    init_epipolar_px: float = number(2.0, 0.01, 1000, "Monocular start: epipolar error up to which a match fits")
-    init_parallax_deg: float = number(1.0, 0, 90, "Monocular start: least median parallax")
+
+    @property
+    def keyframe_rescue_inliers(self) -> int:
+        """New keyframe at once below this many inliers: tracking would end before `keyframe_min_frames` do."""
+        return 3 * self.keyframe_min_inliers // 4
 
 
 @dataclass(frozen=True)
@@ -159,13 +189,17 @@ class ManhattanConfig:
         15, 1, 10_000_000, "Frames between measurements; one costs as much time as tracking several frames"
     )
     settle_frames: int = number(10, 1, 100_000, "Measurements that must agree before the axes are accepted")
-    gate_deg: float = number(3.0, 0, 180, "Distance from the prediction above which a measurement is refused")
     model_sigma_deg: float = number(
         0.15, 1e-6, 90, "Standard deviation of the building's edges from the three directions"
     )
     drift_sigma_deg_per_frame: float = number(
         0.01, 0, 90, "The tracker's rotation error in one frame; it grows with the root of the frames"
     )
+
+    @property
+    def gate_deg(self) -> float:
+        """Distance from the prediction above which a measurement is refused: another building, not another edge."""
+        return 20.0 * self.model_sigma_deg
 
 
 @dataclass(frozen=True)
@@ -187,11 +221,7 @@ class MapperConfig:
     cauchy_medians: float = number(
         0.58, 0, 1000, "Scale of the redescending loss in rounds after the first, in median residuals; 0: none"
     )
-    disparity_sigmas: float = number(
-        1.5, 0, 1000, "Mean error of a point's stereo matches beyond which they count less (depth edges); 0: never"
-    )
     sensors: bool = switch(True, "Local bundle adjustment uses what IMU and wheels measured between keyframes")
-    rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, with outliers removed between them")
     iterations: int = number(5, 1, 1000, "Iterations of a round")
     association: str = word(
         "map",
@@ -201,21 +231,11 @@ class MapperConfig:
     match_radius_px: float = number(10.0, 0, 10_000, "Search radius around the predicted pixel, in both images")
     match_distance_bits: int = number(50, 0, 256, "Largest distance of descriptors")
     match_ratio: float = number(0.85, 0.01, 1, "Best distance below this share of the second best")
-    match_sigma_px: float = number(1.0, 0.001, 100, "Noise of one coordinate of a point found again by its descriptor")
     match_min: int = number(12, 0, 100_000, "Consistent matches below which none is used")
-    near_keyframes: int = number(10, 0, 10_000, "Nearby keyframes whose points are searched too")
-    near_depths: float = number(
-        0.3, 0, 1000, "Distance up to which keyframes are nearby, in median depths of the new keyframe"
-    )
-    min_observations: int = number(2, 0, 10_000, "Keyframes below which a point that is no longer tracked is culled")
     max_error_sigmas: float = number(3.0, 0, 1000, "Mean error of a point's observations above which it is culled")
     min_parallax_deg: float = number(0.1, 0, 90, "Largest angle between a point's rays below which it is too uncertain")
     redundant_share: float = number(
         0.9, 0, 10, "A keyframe is removed when three others see this share of its points; above 1: never"
-    )
-    crowd_keyframes: int = number(5, 1, 10_000, "Keyframes kept of one view")
-    repeated_keyframes: int = number(
-        300, 0, 1_000_000, "Keyframes of earlier visits that are kept besides; further ones are removed once passed"
     )
     full_ba_growth: float = number(1.15, 1, 1e6, "Full bundle adjustment when the map has grown by this factor")
     full_ba_lag_keyframes: int = number(
@@ -224,6 +244,16 @@ class MapperConfig:
     final_iterations: int = number(
         60, 0, 10_000, "Iterations of a round of the full bundle adjustment at the end of a run; 0: none"
     )
+
+    @property
+    def disparity_sigmas(self) -> float:
+        """Mean error of a point's stereo matches beyond which they count less (depth edges); 0: never."""
+        return 2.0 * self.huber_sigmas
+
+    @property
+    def match_sigma_px(self) -> float:
+        """Noise of one coordinate of a point found again by its descriptor: two tracks agree less well than one."""
+        return 2.5 * self.sigma_px
 
     @property
     def most_keyframes(self) -> int | None:
@@ -246,13 +276,11 @@ class LoopConfig:
     )
     robust: str = word("gnc", ("gnc", "switchable", "none"), "How the pose graph withstands a false loop")
     vocabulary: str = path("Vocabulary file; empty: the one in the package")
-    grow_every: int = number(0, 0, 1_000_000, "Keyframes between extensions of the vocabulary in a new place; 0: never")
     score_ratio: float = number(0.9, 0, 10, "Candidates must score above this share of the connected keyframes' score")
     reference: str = word(
         "weakest", ("weakest", "best"), "Which of the connected keyframes' scores (weakest finds more; paper: best)"
     )
     min_score: float = number(0.02, 0, 1, "Score below which no candidate is considered")
-    connected_points: int = number(15, 1, 100_000, "Shared points that make two keyframes connected")
     min_gap: int = number(10, 0, 1_000_000, "Keyframes between a keyframe and its candidate")
     max_candidates: int = number(3, 1, 1000, "Places verified for a keyframe")
     corners: int = number(
@@ -261,36 +289,65 @@ class LoopConfig:
     side_corners: int = number(
         600, 0, 20_000, "Corners in views that face the shelves, to recognise a place in both directions; 0: none"
     )
-    side_inliers: int = number(45, 1, 1_000_000, "Corners of these views that must agree for a loop across directions")
-    side_cells: int = number(6, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain them")
     proximity: bool = switch(True, "Verify also the old keyframe that should be nearest by odometry")
     pause: int = number(10, 0, 1_000_000, "Keyframes after an accepted loop without a search for another")
     min_match_fraction: float = number(0.15, 0, 1, "Share of the keyframe's corners that must match (paper: 0.3)")
     max_distance_bits: int = number(60, 0, 256, "Largest distance of matching descriptors")
     match_ratio: float = number(0.9, 0.01, 1, "Nearest distance below this share of the second nearest")
     sigma_px: float = number(1.0, 0.001, 100, "Noise of a point found again from another viewpoint")
-    disparity_sigma_px: float = number(0.5, 0.001, 100, "Noise of a stereo point's disparity")
-    ransac_iterations: int = number(400, 1, 1_000_000, "RANSAC hypotheses of the verification")
     min_inliers: int = number(30, 1, 1_000_000, "Inliers below which a loop is rejected")
     min_inlier_share: float = number(0.15, 0, 1, "The same as a share of the keyframe's corners")
     min_cells: int = number(8, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain inliers")
-    consistent: int = number(2, 1, 1000, "Successive keyframes that must agree on a loop")
-    consistent_window: int = number(4, 1, 1000, "Keyframes within which they must agree")
-    min_inlier_share_after_gap: float = number(
-        0.3, 0, 1, "Share of inliers required after a loss of tracking, where odometry cannot confirm the loop"
-    )
-    gate_m: float = number(0.3, 0, 1e6, "Distance by which a loop may contradict odometry")
-    gate_m_per_m: float = number(0.01, 0, 1e3, "Increase of this limit per metre travelled since")
-    gate_deg: float = number(3.0, 0, 360, "Angle by which a loop may contradict odometry")
-    gate_deg_per_m: float = number(0.3, 0, 360, "Increase of this limit per metre travelled since")
+    consistent: int = number(2, 1, 1000, "Keyframes, among twice as many, that must agree on a loop")
+    gate_m: float = number(0.3, 0, 1e6, "Distance by which a loop may contradict odometry; it doubles in 30 m")
+    gate_deg: float = number(3.0, 0, 360, "Angle by which a loop may contradict odometry; it doubles in 10 m")
     relocalize_candidates: int = number(16, 1, 10_000, "Places of a saved map that are verified for an image")
     relocalize_keyframes: int = number(6, 1, 1000, "Keyframes whose points form a place")
     relocalize_inliers: int = number(56, 1, 100_000, "Corners that must agree with the pose found in a saved map")
     relocalize_share: float = number(
         0.25, 0, 1, "The same as a share of the camera's corners (near a guess: min_inlier_share)"
     )
-    relocalize_cells: int = number(6, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain them")
     seed: int = number(0, 0, 10**9, "Seed of the RANSAC samples of the verification")
+
+    @property
+    def connected_points(self) -> int:
+        """Shared points that make two keyframes connected: half of what makes a loop."""
+        return self.min_inliers // 2
+
+    @property
+    def side_inliers(self) -> int:
+        """Corners of views that face the shelves that must agree for a loop across directions: products repeat."""
+        return 3 * self.min_inliers // 2
+
+    @property
+    def fewer_cells(self) -> int:
+        """Cells of the image that must contain inliers where only a part of it can: of a side view, of a saved map."""
+        return 3 * self.min_cells // 4
+
+    @property
+    def disparity_sigma_px(self) -> float:
+        """Noise of a stereo point's disparity: both images are of one viewpoint."""
+        return 0.5 * self.sigma_px
+
+    @property
+    def consistent_window(self) -> int:
+        """Newest keyframes among which `consistent` ones must agree on a loop."""
+        return 2 * self.consistent
+
+    @property
+    def min_inlier_share_after_gap(self) -> float:
+        """Share of inliers required after a loss of tracking, where odometry cannot confirm the loop."""
+        return 2.0 * self.min_inlier_share
+
+    @property
+    def gate_m_per_m(self) -> float:
+        """Increase of `gate_m` per metre travelled: drift of scale and heading of a percent."""
+        return self.gate_m / 30.0
+
+    @property
+    def gate_deg_per_m(self) -> float:
+        """Increase of `gate_deg` per metre travelled."""
+        return self.gate_deg / 10.0
 
 
 @dataclass(frozen=True)
@@ -363,8 +420,8 @@ def _with_current_names(data: dict[str, Any]) -> dict[str, Any]:
     """One layer of values under current names; logs a warning for each old name."""
     out, met = renamed(data)
     for old in met:
-        what, now = ("is called", RENAMED[old]) if old in RENAMED else ("is ignored: see", REMOVED[old])
-        logging.getLogger("stereo_sfm").warning("configuration: %s %s %s now", old, what, now)
+        now = f"is called {RENAMED[old]} now" if old in RENAMED else f"is ignored: {REMOVED[old]}"
+        logging.getLogger("stereo_sfm").warning("configuration: %s %s", old, now)
     return out
 
 

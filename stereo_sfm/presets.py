@@ -44,7 +44,6 @@ PRESETS: dict[str, dict[str, Any]] = {
             "keyframe_frames": 0,
             "keyframe_min_frames": 19,
             "keyframe_min_inliers": 80,
-            "keyframe_rescue_inliers": 60,
         },
         "loop": {"enabled": False},
     },

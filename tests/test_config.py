@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereo_sfm.config import RENAMED, Config, dump, estimator_names, explain, from_dict, load
+from stereo_sfm.config import REMOVED, RENAMED, Config, dump, estimator_names, explain, from_dict, load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.pose_graph import ROBUST
 from stereo_sfm.presets import PRESETS
@@ -103,13 +103,14 @@ def test_names_of_earlier_versions_are_accepted(caplog: pytest.LogCaptureFixture
     """From a file with a line that names the new one; from the log of a run without."""
     caplog.set_level(logging.INFO, "stereo_sfm")
     logging.getLogger("stereo_sfm").propagate = True
-    (tmp_path / "old.toml").write_text("[loop]\npixel_sigma = 2.5\ngate_metres = 0.7\n")
+    (tmp_path / "old.toml").write_text("[loop]\npixel_sigma = 2.5\ngate_metres = 0.7\ngrow_every = 5\n")
     config = load(tmp_path / "old.toml", ["tracker.max_error=4"])
     assert (config.loop.sigma_px, config.loop.gate_m, config.tracker.max_error_sigmas) == (2.5, 0.7, 4.0)
     told = [record.getMessage() for record in caplog.records]
     assert [line for line in told if line.startswith("configuration:")] == [
         "configuration: loop.pixel_sigma is called loop.sigma_px now",
         "configuration: loop.gate_metres is called loop.gate_m now",
+        "configuration: loop.grow_every is ignored: the vocabulary does not change while it is used",
         "configuration: tracker.max_error is called tracker.max_error_sigmas now",
     ]
     caplog.clear()
@@ -119,7 +120,12 @@ def test_names_of_earlier_versions_are_accepted(caplog: pytest.LogCaptureFixture
 
 def test_every_earlier_name_leads_to_a_setting() -> None:
     names = {name for name, _, _ in SETTINGS}
-    assert set(RENAMED.values()) <= names and not set(RENAMED) & names
+    assert set(RENAMED.values()) <= names and not (set(RENAMED) | set(REMOVED)) & names
+
+
+def test_settings_are_few() -> None:
+    """What can be derived from another setting, or what nobody needs to change, is none."""
+    assert sum("range" in field.metadata for _, field, _ in SETTINGS) <= 80
 
 
 def test_an_explained_configuration_has_every_sentence_and_is_read_back() -> None:

@@ -7,7 +7,8 @@ stereo points too, they are projected into a. The uncertainty of a point's range
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,14 +16,14 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.loop import p3p, pose_kernels
+from stereo_sfm.loop.p3p import Lens
 from stereo_sfm.types import F64, I64, Bool
 
 CHI2_2DOF_95 = 5.991
 IDENTITY, DAMPING = np.eye(4), 1e-9 * np.eye(6)
 
 
-@dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(NamedTuple):
     """N matched points; NaN rows for unknown values."""
 
     points_a: F64  # (N, 3) metres in frame a, never NaN
@@ -34,13 +35,15 @@ class Matches:
     uv_left_a: F64  # (N, 2) px
     uv_right_a: F64  # (N, 2) px
 
-    def __len__(self) -> int:
+    @property
+    def size(self) -> int:
+        """N."""
         return len(self.points_a)
 
 
 def joined(parts: Sequence[Matches]) -> Matches:
     """All matches of several lists."""
-    return Matches(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Matches)))
+    return Matches(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,28 +60,15 @@ def ransac_pose(
     matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float, iterations: int = 400
 ) -> F64 | None:
     """b_T_a (4, 4) with the smallest truncated error, or None if no sample of three gives a pose."""
-    if len(matches) < 4:
+    if matches.size < 4:
         return None
     bearings = rig.left.unproject(matches.uv_left_b)
     usable = np.flatnonzero(np.isfinite(bearings[:, 0]))
     if len(usable) < 4:
         return None
     samples = usable[_distinct_triples(rng, len(usable), iterations)]
-    best, cost = p3p.ransac(
-        matches.points_a,
-        matches.sigmas_a,
-        bearings,
-        matches.uv_left_b,
-        matches.points_b,
-        matches.sigmas_b,
-        matches.uv_left_a,
-        rig.left.model_id,
-        rig.left.params,
-        pixel_sigma,
-        CHI2_2DOF_95,
-        samples,
-        0.9999,
-    )
+    lens = Lens(rig.left.model_id, rig.left.params, pixel_sigma)
+    best, cost = p3p.ransac(matches, bearings, lens, CHI2_2DOF_95, samples, 0.9999)
     return se3.orthonormalize(np.vstack([best, [0, 0, 0, 1]])) if np.isfinite(cost) else None
 
 
@@ -95,11 +85,8 @@ def _distinct_triples(rng: np.random.Generator, n: int, count: int) -> I64:
 
 def consistent(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float) -> Bool:
     """(N,): the error is within the 95 % bound from a to b, and from b to a where b has the point."""
-    m, camera = matches, rig.left
-    return pose_kernels.consistent(
-        b_T_a, se3.inverse(b_T_a), m.points_a, m.sigmas_a, m.uv_left_b, m.points_b, m.sigmas_b, m.uv_left_a,
-        camera.model_id, camera.params, pixel_sigma, CHI2_2DOF_95,
-    )  # fmt: skip
+    lens = Lens(rig.left.model_id, rig.left.params, pixel_sigma)
+    return pose_kernels.consistent(b_T_a, se3.inverse(b_T_a), matches, lens, CHI2_2DOF_95)
 
 
 def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iterations: int = 10) -> Pose:
@@ -129,10 +116,9 @@ def _normal_equations(
     back = se3.inverse(t)
 
     def add(camera: Camera, camera_T_left: F64, ahead: F64, behind: F64, uv_b: F64, uv_a: F64) -> None:
-        pose_kernels.add_normal_equations(
-            t, camera_T_left, ahead, behind, m.points_a, m.sigmas_a, uv_b, m.points_b, m.sigmas_b, uv_a,
-            inlier, camera.model_id, camera.params, pixel_sigma, hessian, gradient, sums,
-        )  # fmt: skip
+        seen, lens = m._replace(uv_left_b=uv_b, uv_left_a=uv_a), Lens(camera.model_id, camera.params, pixel_sigma)
+        poses = t, camera_T_left, ahead, behind
+        pose_kernels.add_normal_equations(*poses, seen, inlier, lens, (hessian, gradient, sums))
 
     add(rig.left, IDENTITY, t, back, m.uv_left_b, m.uv_left_a)
     if rig.right is not None and right_T_left is not None:

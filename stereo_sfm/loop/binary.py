@@ -11,7 +11,7 @@ import numpy as np
 
 from stereo_sfm.geometry.hamming import BITS, U64, as_words, hamming, hamming_to_all
 from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.types import F32, I32, I64, U8, Bool
+from stereo_sfm.types import I32, I64, U8, Bool
 
 
 def present(descriptors: U8) -> Bool:
@@ -88,12 +88,10 @@ def _assign(words, members, centres):
 
 @njit
 def descend(words, centroids, first_child, child_count):
-    """Leaf node reached by every descriptor, and its distance to that leaf's centroid."""
+    """Leaf node reached by every descriptor."""
     node = np.zeros(words.shape[0], np.int32)
-    distance = np.zeros(words.shape[0], np.int32)
     for i in range(words.shape[0]):
         at = 0
-        low = BITS + 1
         while child_count[at] > 0:
             low = BITS + 1
             start = first_child[at]
@@ -103,8 +101,7 @@ def descend(words, centroids, first_child, child_count):
                     low = d
                     at = c
         node[i] = at
-        distance[i] = low
-    return node, distance
+    return node
 
 
 def k_majority(words: U64, members: I32, k: int, rng: np.random.Generator, rounds: int = 10) -> tuple[U64, I32]:
@@ -141,26 +138,25 @@ def k_majority(words: U64, members: I32, k: int, rng: np.random.Generator, round
 
 
 def match_descriptors(
-    query: U8, train: U8, group: I64 | None = None, max_distance: int = 64, ratio: float = 1.0, mutual: bool = True
-) -> tuple[I32, I32, F32]:
-    """Pairs of nearest descriptors.
+    query: U8, train: U8, group: I64 | None = None, max_distance: int = 64, ratio: float = 1.0
+) -> tuple[I32, I32]:
+    """Pairs of mutually nearest descriptors.
 
     Args:
         query: (N, 32). train: (M, 32).
         group: (M,) rows of train with the same value are one physical point and do not compete in the ratio test.
         max_distance: bits; ratio: nearest / nearest of another point must not exceed it (1: no test).
-        mutual: keep a pair only if the query row is also the nearest to the train row.
 
     Returns:
-        Query rows, train rows, distances in bits: (K,) each, ascending in the query row.
+        Query rows, train rows: (K,) each, ascending in the query row.
     """
     q_rows, t_rows = np.flatnonzero(present(query)).astype(np.int32), np.flatnonzero(present(train)).astype(np.int32)
     a, b = as_words(query[q_rows]), as_words(train[t_rows])
     groups = np.arange(len(b)) if group is None else np.ascontiguousarray(group[t_rows])
     best, first, second = _two_nearest(a, b, groups)
     ok = (best >= 0) & (first <= max_distance) & (first <= ratio * second)
-    if mutual and ok.any():
+    if ok.any():
         queried, back_row = np.unique(best[ok], return_inverse=True)
         back, _, _ = _two_nearest(b[queried], a, np.arange(len(a)))
         ok[ok] = back[back_row] == np.flatnonzero(ok)
-    return q_rows[ok], t_rows[best[ok]], first[ok].astype(np.float32)
+    return q_rows[ok], t_rows[best[ok]]

@@ -29,27 +29,30 @@ from stereo_sfm.loop.sideways import (
     sideways_config,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import Verdict, corner_sightings, looks_alike, rejection, verify, verify_near, within
+from stereo_sfm.loop.verification import (
+    CONFIDENT_SHARE,
+    Verdict,
+    corner_sightings,
+    looks_alike,
+    rejection,
+    verify,
+    verify_near,
+    within,
+)
 from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.correction import DRIFT
+from stereo_sfm.mapping.culling import OF_A_VIEW, OF_EARLIER_VISITS, PASSED
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
 PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
-KEPT_NEWEST = 30  # newest keyframes, none of which is removed
-MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
 KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
-MAX_REPEATED = 300  # keyframes added to views of earlier visits; then one goes for each that comes
-DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
-STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the same of the share of corners of its best keyframe, where several found it
 LOOKALIKES = 3000  # hypotheses between sessions that are remembered
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
-CHANCE = 0.25  # share of corners, ahead and beside, that agree where a place only looks alike
-MIN_SUPPORT = 0.3  # sum of what the shares of keyframes exceed that by: two with 0.4, or three with 0.35
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
-SIDE_CANDIDATES = 1, 3  # across directions: besides the one by odometry, and without one
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # largest difference of two keyframes' estimates of one loop
 
 
@@ -95,6 +98,7 @@ class LoopCloser:
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._side_config = sideways_config(config)
+        self._chance = config.relocalize_share  # of corners that agree where a place only looks alike
         self._source_rig, self._rig_terms = rig, np.zeros(RIG_TERMS)
         self._own: dict[int, Rig] = {}  # of keyframes of other rigs
         self._vocabulary = vocabulary
@@ -114,11 +118,6 @@ class LoopCloser:
         self._sees_sides = False  # some keyframe had views that face shelves
 
     @property
-    def vocabulary(self) -> Vocabulary:
-        """The current vocabulary, which may have grown."""
-        return self._vocabulary
-
-    @property
     def keyframe_count(self) -> int:
         """Number of keyframes that can be candidates."""
         return len(self._store)
@@ -134,7 +133,6 @@ class LoopCloser:
         result = self._search(keyframe, bags) if keyframe.described else unseen
         self._keep(keyframe, bags)
         gone = self._cull(keyframe.kf_id)
-        self._grow(keyframe)
         return dataclasses.replace(result, forgotten_kf_ids=np.array(gone, np.int64)) if gone else result
 
     def _search(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> LoopResult:
@@ -195,15 +193,15 @@ class LoopCloser:
         Returns:
             Keyframes that are no candidates any more, or never were.
         """
-        settled = newest - KEPT_NEWEST
+        settled = newest - PASSED
         if settled not in self._store:
             return [settled] if settled >= 0 else []
         before = self._store.ids[: bisect(self._store.ids, settled)]
         known = [k for k in self._graph.same_view(settled, KNOWN_VIEWS) if k <= settled]
         came_back = known[0] < max(set(before).difference(known), default=-1)
         same_view = [k for k in self._graph.same_view(settled) if k <= settled]
-        gone = same_view[1] if len(same_view) > MAX_SAME_VIEW else -1
-        if came_back and self._repeated >= MAX_REPEATED:
+        gone = same_view[1] if len(same_view) > OF_A_VIEW else -1
+        if came_back and self._repeated >= OF_EARLIER_VISITS:
             gone = settled
         if gone >= 0:
             self._graph.exclude(gone)
@@ -212,7 +210,7 @@ class LoopCloser:
         self._repeated += came_back and gone < 0
         if (rows := self._graph.forget()) is not None:
             self._fronts.keep(rows)
-        if 2 * len(self._store) < len(self._database) - KEPT_NEWEST:
+        if 2 * len(self._store) < len(self._database) - PASSED:
             self._row = {k: row for row, k in enumerate(self._store.ids)}
             kept = np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids))
             self._database.keep(kept)
@@ -225,7 +223,7 @@ class LoopCloser:
         if not config.enabled:
             return [], "disabled"
         if self._paused(keyframe.kf_id):
-            return self._turned_candidate(keyframe, side_bag), "paused"
+            return self._side_candidates(keyframe, side_bag, None), "paused"
         connected = self._store.connected(keyframe.point_ids, config.connected_points)
         scores = self._database.scores(bag)
         pick = max if config.reference == "best" else min
@@ -251,34 +249,29 @@ class LoopCloser:
         """Whether the last loop was so shortly before that only the way back along it is looked for."""
         return kf_id - self._last_loop <= self._config.pause and self._graph.unbroken(self._last_loop, kf_id)
 
-    def _side_candidates(self, keyframe: Keyframe, bag: voc.Bag, excluded: set[int]) -> list[Candidate]:
-        """The keyframe that should have seen the same fronts, by odometry, and those whose views look most alike."""
+    def _side_candidates(self, keyframe: Keyframe, bag: voc.Bag, excluded: set[int] | None) -> list[Candidate]:
+        """The keyframe that should have seen the same fronts, by odometry, and those whose views look most alike.
+
+        Args: excluded, not these; None: only the one by odometry, as the search pauses.
+        """
         if len(keyframe.sides) < MIN_CORNERS:
             return []
         scores = self._side_database.scores(bag)
         graph_ids, cam_T_kf = self._graph.around(keyframe.kf_id)
-        excluded = excluded | set(graph_ids[cam_T_kf[:, 2, 2] >= TURNED].tolist())  # other corners show those
+        pauses, ahead = excluded is None, set(graph_ids[cam_T_kf[:, 2, 2] >= TURNED].tolist())
+        excluded = set[int]() if excluded is None else excluded | ahead  # whose other corners show more
         turned = graph_ids[self._fronts.turned(front_of(keyframe), cam_T_kf)].tolist()
         places = [k for k in turned if k in self._store and k not in excluded][:1]
-        wanted = len(places) + (SIDE_CANDIDATES[0] if places else SIDE_CANDIDATES[1])
+        wanted = 2 if places else self._config.max_candidates
         ids = self._side_database.kf_ids
         for i in np.lexsort((np.arange(len(scores)), -with_neighbours(scores))).tolist():
-            if len(places) == wanted or scores[i] < self._config.min_score:
+            if pauses or len(places) == wanted or scores[i] < self._config.min_score:
                 break
             kf_id = int(ids[i])
             free = kf_id in self._store and kf_id not in excluded
             if free and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
                 places.append(kf_id)
         return [Candidate(k, float(scores[self._row[k]]), True) for k in places]
-
-    def _turned_candidate(self, keyframe: Keyframe, bag: voc.Bag) -> list[Candidate]:
-        """While the search pauses: the keyframe that should have seen the same fronts from another direction."""
-        if len(keyframe.sides) < MIN_CORNERS:
-            return []
-        graph_ids, cam_T_kf = self._graph.around(keyframe.kf_id)
-        turned = graph_ids[self._fronts.turned(front_of(keyframe), cam_T_kf)].tolist()
-        scores = self._side_database.scores(bag)
-        return [Candidate(k, float(scores[self._row[k]]), True) for k in turned if k in self._store][:1]
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
         """Keyframes that cannot be candidates: connected to this one, or shortly before it in the same submap."""
@@ -372,14 +365,14 @@ class LoopCloser:
         else:
             gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
             anywhere = gap is None
-            off = math.nan if gap is None else gap.deviation - DRIFT_PER_METRE * gap.distance
+            off = math.nan if gap is None else gap.deviation - DRIFT[0] * gap.distance
             if of.sideways:
                 enough = verdict.inliers >= SIDE_FACTOR * config.side_inliers
             else:
                 least = 2 * config.min_inliers
                 enough = verdict.inliers >= least and verdict.share >= config.min_inlier_share_after_gap
                 share = self._agreeing_share(keyframe, candidate, verdict)
-                strong = verdict.inliers >= STRONG[0] * config.min_inliers and min(verdict.share, share) >= STRONG[1]
+                strong = verdict.inliers >= 3 * config.min_inliers and min(verdict.share, share) >= CONFIDENT_SHARE
                 votes = 1 if strong and gap is not None and off <= gap.tolerance else votes
             reached = gap is None or off <= gap.disturbed
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
@@ -402,7 +395,7 @@ class LoopCloser:
             return "ambiguous"
         if loop.anywhere and not loop.sideways and self._looked_alike(loop, max(support.values())):
             return "ambiguous"
-        enough = loop.votes == 1 or loop.sideways or _total(support) >= MIN_SUPPORT
+        enough = loop.votes == 1 or loop.sideways or self._total(support) >= 2 * (CONFIDENT_SHARE - self._chance)
         return "" if len(support) >= loop.votes and enough else "not_confirmed_yet"
 
     def _rivals(self, other: _Hypothesis, loop: _Hypothesis, support: dict[int, float]) -> bool:
@@ -416,7 +409,8 @@ class LoopCloser:
             return False
         others = self._support(other, GAP_WINDOW)
         alike = RIVAL if len(support) == 1 else TWIN
-        return _total(others) > RIVAL * _total(support) or max(others.values()) > alike * max(support.values())
+        more = self._total(others) > RIVAL * self._total(support)
+        return more or max(others.values()) > alike * max(support.values())
 
     def _looked_alike(self, loop: _Hypothesis, share: float) -> bool:
         """Whether some other place looked about as much like a keyframe of this session as this one does.
@@ -434,6 +428,10 @@ class LoopCloser:
             if h.kf_id in newest and (h is loop or (not h.against and self._same_loop(h, loop))):
                 shares[h.kf_id] = max(h.share, shares.get(h.kf_id, 0.0))
         return shares
+
+    def _total(self, support: dict[int, float]) -> float:
+        """What speaks for a loop: by how much the shares of the keyframes that found it exceed those of chance."""
+        return sum(max(share - self._chance, 0.0) for share in support.values())
 
     def _same_loop(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
         """Whether two loops agree; None if no path connects them."""
@@ -476,14 +474,3 @@ class LoopCloser:
             rejected=rejected,
             sightings=verdict.sightings,
         )
-
-    def _grow(self, keyframe: Keyframe) -> None:
-        every = self._config.grow_every
-        if every and keyframe.kf_id % every == every - 1:
-            recent = [self._store[k].corners.descriptors for k in self._store.ids[-every:]]
-            self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
-
-
-def _total(support: dict[int, float]) -> float:
-    """What speaks for a loop: by how much the shares of the keyframes that found it exceed those of chance."""
-    return sum(max(share - CHANCE, 0.0) for share in support.values())

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import dijkstra
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Bool
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views
@@ -22,8 +21,7 @@ MIN_SPEED = 0.5  # metres a second, lower bound of that speed
 SPEED_NS = 1_000_000_000  # time before a gap over which it is measured
 KNOWN_PATHS = 4096  # that are remembered
 FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
-NEWEST_KEYFRAMES, NEWEST_LOOPS = 128, 256  # that stay, candidates or not
-BETWEEN_CHAINS = 64  # newest loops between two chains that stay
+NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two chains half
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
@@ -49,34 +47,21 @@ class GapMotion:
 class _Nodes(Columns):
     """One row for each keyframe."""
 
-    kf_id: I64  # ascending
-    stamp_ns: I64
-    chain: I64  # number of the uninterrupted part of the odometry
-    odom_T_cam: F64  # (K, 4, 4)
-    anchored: F64  # (K, 4, 4) the same, corrected at each loop to the pose of its older end
-    frame: I64  # the chain whose frame `anchored` is in
-    distance: F64  # metres since the start
-    kept: Bool  # False: no longer a candidate
-
-    SPEC: ClassVar[Spec] = {
-        "kf_id": (np.int64, (), -1),
-        "stamp_ns": (np.int64, (), 0),
-        "chain": (np.int64, (), 0),
-        "odom_T_cam": (np.float64, (4, 4), np.eye(4)),
-        "anchored": (np.float64, (4, 4), np.eye(4)),
-        "frame": (np.int64, (), 0),
-        "distance": (np.float64, (), 0.0),
-        "kept": (np.bool_, (), True),
-    }
+    kf_id: I64 = column(np.int64, -1)  # ascending
+    stamp_ns: I64 = column(np.int64, 0)
+    chain: I64 = column(np.int64, 0)  # number of the uninterrupted part of the odometry
+    odom_T_cam: F64 = column(np.float64, np.eye(4), (4, 4))  # (K, 4, 4)
+    anchored: F64 = column(np.float64, np.eye(4), (4, 4))  # corrected at each loop to the pose of its older end
+    frame: I64 = column(np.int64, 0)  # the chain whose frame `anchored` is in
+    distance: F64 = column(np.float64, 0.0)  # metres since the start
+    kept: Bool = column(np.bool_, True)  # False: no longer a candidate
 
 
 class _Loops(Columns):
     """One row for each accepted loop."""
 
-    ends: I64  # (L, 2) rows of the keyframes a and b
-    a_T_b: F64  # (L, 4, 4)
-
-    SPEC: ClassVar[Spec] = {"ends": (np.int64, (2,), -1), "a_T_b": (np.float64, (4, 4), np.eye(4))}
+    ends: I64 = column(np.int64, -1, (2,))  # (L, 2) rows of the keyframes a and b
+    a_T_b: F64 = column(np.float64, np.eye(4), (4, 4))  # (L, 4, 4)
 
 
 class KeyframeGraph:
@@ -124,8 +109,8 @@ class KeyframeGraph:
             return None
         a, b = loops.ends.T
         needed = (nodes.kept[a] & nodes.kept[b]) | _newest_between(nodes.chain[a], nodes.chain[b])
-        needed |= np.arange(len(loops)) >= len(loops) - NEWEST_LOOPS
-        stay = nodes.kept | (np.arange(count) >= count - NEWEST_KEYFRAMES)
+        needed |= np.arange(len(loops)) >= len(loops) - 2 * NEWEST
+        stay = nodes.kept | (np.arange(count) >= count - NEWEST)
         stay[loops.ends[needed].ravel()] = True
         for row in np.flatnonzero(nodes.chain[1:] != nodes.chain[:-1]).tolist():
             stay[max(row + 1 - AROUND_A_GAP, 0) : row + 2] = True
@@ -264,7 +249,7 @@ def _newest_between(a: I64, b: I64) -> Bool:
     order = np.argsort(pair, kind="stable")
     later = np.empty(len(a), np.int64)  # loops between the same two that came later
     later[order] = np.cumsum(np.bincount(pair))[pair[order]] - 1 - np.arange(len(a))
-    return (a != b) & (later < BETWEEN_CHAINS)
+    return (a != b) & (later < NEWEST // 2)
 
 
 def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
 from stereo_sfm.mapping import map_kernels
-from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.types import I32, I64, Keyframe
 
@@ -15,20 +13,16 @@ from stereo_sfm.types import I32, I64, Keyframe
 class _Sightings(Columns):
     """One row for each point of each keyframe; those of a point are a linked list, as in the map."""
 
-    kf: I32  # its number, see `KeyframeStore`
-    point: I32  # row of the point, -1: removed
-    following: I32  # next older row of the same point, -1: last
-
-    SPEC: ClassVar[Spec] = {"kf": (np.int32, (), -1), "point": (np.int32, (), -1), "following": (np.int32, (), -1)}
+    kf: I32 = column(np.int32, -1)  # its number, see `KeyframeStore`
+    point: I32 = column(np.int32, -1)  # row of the point, -1: removed
+    following: I32 = column(np.int32, -1)  # next older row of the same point, -1: last
 
 
 class _Points(Columns):
     """One row for each point."""
 
-    head: I32  # newest sighting, -1: none
-    merged_into: I32  # row of the same physical point, -1: none
-
-    SPEC: ClassVar[Spec] = {"head": (np.int32, (), -1), "merged_into": (np.int32, (), -1)}
+    head: I32 = column(np.int32, -1)  # newest sighting, -1: none
+    merged_into: I32 = column(np.int32, -1)  # row of the same physical point, -1: none
 
 
 class KeyframeStore:
@@ -64,6 +58,11 @@ class KeyframeStore:
         """Ids of points that the kept keyframes see, and of others until the next compaction."""
         return len(self._point_rows)
 
+    @property
+    def _lists(self) -> map_kernels.Lists:
+        table = self._sightings
+        return map_kernels.Lists(self._points.head, table.following, table.kf, table.point)
+
     def _find(self, point_ids: I64) -> I64:
         """(N,) row of each point after merges, -1 where it is unknown."""
         rows = self._point_rows.find(point_ids)
@@ -86,7 +85,7 @@ class KeyframeStore:
         points = np.unique(self._know(np.asarray(keyframe.point_ids)))
         rows = self._sightings.append(len(points), kf=number, point=points)
         self._rows[keyframe.kf_id] = rows.start, len(points)
-        map_kernels.link(rows.start, self._points.head, self._sightings.following, self._sightings.point)
+        map_kernels.link(rows.start, self._lists)
 
     def remove(self, kf_id: int) -> None:
         """Remove a keyframe."""
@@ -95,7 +94,7 @@ class KeyframeStore:
         self._free.append(self._numbered.index(kf_id))
         first, count = self._rows.pop(kf_id)
         rows, table = np.arange(first, first + count), self._sightings
-        map_kernels.unlink(rows[table.point[rows] >= 0], self._points.head, table.following, table.point)
+        map_kernels.unlink(rows[table.point[rows] >= 0], self._lists)
         if len(table) > 2 * sum(count for _, count in self._rows.values()) + 4096:
             self._compact()
 
@@ -126,24 +125,23 @@ class KeyframeStore:
 
     def merge(self, pairs: I64) -> None:
         """(M, 2) point ids: the second is the same physical point as the first."""
-        table = self._sightings
         for k in range(len(pairs)):
             root, merged_root = self._know(pairs[k]).tolist()
             if root == merged_root:
                 continue
-            points = self._points
+            points, lists = self._points, self._lists
             both = np.empty(len(self.ids), np.int64)  # a keyframe with both ids counts once
-            count = map_kernels.seen_together(merged_root, root, points.head, table.following, table.kf, both)
-            map_kernels.unlink(both[:count], points.head, table.following, table.point)
-            map_kernels.hand_over(merged_root, root, points.head, table.following, table.point)
+            count = map_kernels.seen_together(merged_root, root, lists, both)
+            map_kernels.unlink(both[:count], lists)
+            map_kernels.hand_over(merged_root, root, lists)
             points.head[merged_root], points.merged_into[merged_root] = -1, root
 
     def _shared(self, point_ids: I64) -> tuple[I64, I64]:
         """(K,) ids of the keyframes that see some of these points, ascending, and (K,) how many."""
-        points, table = np.unique(self._find(point_ids)), self._sightings
+        points = np.unique(self._find(point_ids))
         points = points[points >= 0]
         counts = np.zeros(len(self._numbered), np.int64)
-        map_kernels.count_by_keyframe(points, self._points.head, table.following, table.kf, counts)
+        map_kernels.count_by_keyframe(points, self._lists, counts)
         seeing = np.flatnonzero(counts)
         ids = np.array(self._numbered, np.int64)[seeing]
         order = np.argsort(ids)

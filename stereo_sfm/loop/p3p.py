@@ -6,12 +6,14 @@ ECCV 2018; the steps are derived anew)."""
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereo_sfm.geometry.kernels import KANNALA_BRANDT, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import dot
 from stereo_sfm.loop.cost_bound import SLACK, fisheye_bound, make_columns
+from stereo_sfm.types import F64
 
 
 @inner
@@ -164,8 +166,16 @@ def p3p(points, bearings):
     return out, count
 
 
+class Lens(NamedTuple):
+    """A camera, and the noise of its pixels."""
+
+    model: int
+    params: F64
+    sigma: float  # px
+
+
 @inner
-def squared_error(t, point, range_sigma, uv, model, params, pixel_sigma):
+def squared_error(t, point, range_sigma, uv, lens):
     """Squared reprojection error over its variance: pixel noise and the point's own range uncertainty along its ray.
 
     `t` (3, 4) takes the point into the camera. Infinite where the camera cannot see the point.
@@ -173,7 +183,7 @@ def squared_error(t, point, range_sigma, uv, model, params, pixel_sigma):
     x = t[0, 0] * point[0] + t[0, 1] * point[1] + t[0, 2] * point[2] + t[0, 3]
     y = t[1, 0] * point[0] + t[1, 1] * point[1] + t[1, 2] * point[2] + t[1, 3]
     z = t[2, 0] * point[0] + t[2, 1] * point[1] + t[2, 2] * point[2] + t[2, 3]
-    u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, x, y, z)
+    u, v, j00, j01, j02, j10, j11, j12 = project_one(lens.model, lens.params, x, y, z)
     ru, rv = u - uv[0], v - uv[1]
     if not math.isfinite(ru):
         return math.inf
@@ -184,7 +194,7 @@ def squared_error(t, point, range_sigma, uv, model, params, pixel_sigma):
     rz = (t[2, 0] * point[0] + t[2, 1] * point[1] + t[2, 2] * point[2]) * k
     du = j00 * rx + j01 * ry + j02 * rz
     dv = j10 * rx + j11 * ry + j12 * rz
-    s2 = pixel_sigma * pixel_sigma
+    s2 = lens.sigma * lens.sigma
     along = ru * du + rv * dv
     return (ru * ru + rv * rv - along * along / (s2 + du * du + dv * dv)) / s2
 
@@ -201,29 +211,30 @@ def inverse34(t):
 
 
 @inner
-def _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, worst):
+def _cost(t, m, lens, limit, worst):
     """Truncated cost over both directions (MSAC); stops early once it is no better than `worst`."""
     back = inverse34(t)
     total = 0.0
-    for i in range(points.shape[0]):
-        total += min(squared_error(t, points[i], sigmas[i], uv_b[i], model, params, pixel_sigma), limit)
-        if math.isfinite(points_b[i, 0]) and math.isfinite(uv_a[i, 0]):
-            total += min(squared_error(back, points_b[i], sigmas_b[i], uv_a[i], model, params, pixel_sigma), limit)
+    for i in range(m.points_a.shape[0]):
+        total += min(squared_error(t, m.points_a[i], m.sigmas_a[i], m.uv_left_b[i], lens), limit)
+        if math.isfinite(m.points_b[i, 0]) and math.isfinite(m.uv_left_a[i, 0]):
+            total += min(squared_error(back, m.points_b[i], m.sigmas_b[i], m.uv_left_a[i], lens), limit)
         if total >= worst:
             return total
     return total
 
 
 @njit
-def ransac(
-    points, sigmas, bearings, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, samples, confidence
-):
+def ransac(m, bearings, lens, limit, samples, confidence):
     """Best b_T_a over the given samples (S, 3) of rows, stopping when `confidence` is reached.
+
+    Args:
+        m: Matches. bearings: (N, 3) unit, of their left pixels in b. lens: of the left camera. limit: of an error.
 
     Returns:
         (3, 4) transform, its cost (infinite when there is none).
     """
-    ahead, back = make_columns(points, sigmas, uv_b), make_columns(points_b, sigmas_b, uv_a)
+    ahead, back = make_columns(m.points_a, m.sigmas_a, m.uv_left_b), make_columns(m.points_b, m.sigmas_b, m.uv_left_a)
     best = np.zeros((3, 4))
     three, rays = np.empty((3, 3)), np.empty((3, 3))
     lowest = math.inf
@@ -233,23 +244,23 @@ def ransac(
             break
         for i in range(3):
             for c in range(3):
-                three[i, c], rays[i, c] = points[samples[s, i], c], bearings[samples[s, i], c]
+                three[i, c], rays[i, c] = m.points_a[samples[s, i], c], bearings[samples[s, i], c]
         solutions, count = p3p(three, rays)
         for k in range(count):
             t = solutions[k]
-            if model == KANNALA_BRANDT:
-                bound = fisheye_bound(t, ahead, params, pixel_sigma, limit)
-                if bound + fisheye_bound(inverse34(t), back, params, pixel_sigma, limit) > lowest + SLACK:
+            if lens.model == KANNALA_BRANDT:
+                bound = fisheye_bound(t, ahead, lens.params, lens.sigma, limit)
+                if bound + fisheye_bound(inverse34(t), back, lens.params, lens.sigma, limit) > lowest + SLACK:
                     continue
-            cost = _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, lowest)
+            cost = _cost(t, m, lens, limit, lowest)
             if cost < lowest:
                 lowest = cost
                 best = t.copy()
                 inside = 0
-                for i in range(points.shape[0]):
-                    e = squared_error(t, points[i], sigmas[i], uv_b[i], model, params, pixel_sigma)
+                for i in range(m.points_a.shape[0]):
+                    e = squared_error(t, m.points_a[i], m.sigmas_a[i], m.uv_left_b[i], lens)
                     inside += 1 if e < limit else 0
-                w = inside / points.shape[0]
+                w = inside / m.points_a.shape[0]
                 miss = 1 - w * w * w
                 if miss <= 0:
                     needed = s + 1

@@ -14,43 +14,36 @@ from stereo_sfm.loop.p3p import squared_error
 
 
 @njit
-def consistent(t, back, points_a, sigmas_a, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit):
+def consistent(t, back, m, lens, limit):
     """(N,): the squared error over its variance is below `limit` from a to b, and from b to a where that is known.
 
     Args:
-        t, back: (4, 4) b_T_a and its inverse. The other columns as in `absolute_pose.Matches`, of the left images.
+        t, back: (4, 4) b_T_a and its inverse. m: Matches. lens: of the left camera.
     """
-    out = np.zeros(points_a.shape[0], np.bool_)
-    for i in range(points_a.shape[0]):
-        if math.isfinite(points_a[i, 0]) and math.isfinite(uv_b[i, 0]):
-            out[i] = squared_error(t, points_a[i], sigmas_a[i], uv_b[i], model, params, pixel_sigma) < limit
-        if out[i] and math.isfinite(points_b[i, 0]) and math.isfinite(uv_a[i, 0]):
-            out[i] = not squared_error(back, points_b[i], sigmas_b[i], uv_a[i], model, params, pixel_sigma) >= limit
+    out = np.zeros(m.points_a.shape[0], np.bool_)
+    for i in range(out.shape[0]):
+        if math.isfinite(m.points_a[i, 0]) and math.isfinite(m.uv_left_b[i, 0]):
+            out[i] = squared_error(t, m.points_a[i], m.sigmas_a[i], m.uv_left_b[i], lens) < limit
+        if out[i] and math.isfinite(m.points_b[i, 0]) and math.isfinite(m.uv_left_a[i, 0]):
+            out[i] = not squared_error(back, m.points_b[i], m.sigmas_b[i], m.uv_left_a[i], lens) >= limit
     return out
 
 
 @njit
-def add_normal_equations(
-    t, camera_T_left, ahead, behind, points_a, sigmas_a, uv_b, points_b, sigmas_b, uv_a,
-    use, model, params, pixel_sigma, hessian, gradient, sums,
-):  # fmt: skip
-    """Adds what one camera's images of a and b tell about exp(xi) @ t to hessian (6, 6), gradient (6,) and sums (2,).
+def add_normal_equations(t, camera_T_left, ahead, behind, m, use, lens, system):
+    """Adds what one camera's images of a and b tell about exp(xi) @ t.
 
     Args:
         t: (4, 4) b_T_a. camera_T_left: (4, 4). ahead, behind: camera_T_left @ t, and @ inverse(t).
-        The columns up to `use` (N,) as in `absolute_pose.Matches`, the pixels of this camera.
-        sums: squared normalised errors, and the number of points.
+        m: Matches, whose left pixels are those of this camera. use: (N,). lens: of this camera.
+        system: hessian (6, 6), gradient (6,), and (2,) squared normalised errors and the number of points.
     """
-    _add(t, ahead, camera_T_left, True, points_a, sigmas_a, uv_b, use, model, params, pixel_sigma,
-         hessian, gradient, sums)  # fmt: skip
-    _add(t, behind, -behind, False, points_b, sigmas_b, uv_a, use, model, params, pixel_sigma,
-         hessian, gradient, sums)  # fmt: skip
+    _add(t, ahead, camera_T_left, True, m.points_a, m.sigmas_a, m.uv_left_b, use, lens, system)
+    _add(t, behind, -behind, False, m.points_b, m.sigmas_b, m.uv_left_a, use, lens, system)
 
 
 @inner
-def _add(
-    t, camera_T_source, turn, forward, points, sigmas, uv, use, model, params, pixel_sigma, hessian, gradient, sums
-):
+def _add(t, camera_T_source, turn, forward, points, sigmas, uv, use, lens, system):
     """As `add_normal_equations`, from points seen in one image.
 
     Args:
@@ -59,13 +52,16 @@ def _add(
         forward: the points are in a, and t takes them to b; else they are in b.
         points, sigmas, uv, use: (N, 3), (N,) metres along the ray, (N, 2) px, (N,); NaN where unknown.
     """
-    s2 = pixel_sigma * pixel_sigma
+    hessian, gradient, sums = system
+    s2 = lens.sigma * lens.sigma
     j = np.empty((2, 6))
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if not use[i] or not math.isfinite(x) or not math.isfinite(uv[i, 0]):
             continue
-        u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, *transform_point(camera_T_source, x, y, z))
+        u, v, j00, j01, j02, j10, j11, j12 = project_one(
+            lens.model, lens.params, *transform_point(camera_T_source, x, y, z)
+        )
         if not math.isfinite(u):
             continue
         b0, b1, b2 = transform_point(t, x, y, z) if forward else (x, y, z)

@@ -17,12 +17,9 @@ from stereo_sfm.loop.verification import pair
 from stereo_sfm.types import F64, Keyframe
 
 NEWEST_KEYFRAMES = 12  # searched
-CANDIDATES = 2  # that are matched: those whose views should be most similar
-NEIGHBOURS = 2  # keyframes whose points are added to a candidate's own
+NEAREST = 2  # keyframes that are matched, of the most similar views, and others whose points are added to each one's
 WINDOWS = 0.05, 0.12, 0.3  # radius of the search, as shares of the image's width
-PIXEL_SIGMA = 2.0  # px, of a corner matched from a distant view
 MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners
-METRES_PER_RADIAN = 2.0  # translation that changes the view as much as a rotation by one radian
 
 
 class RecentPlaces:
@@ -54,7 +51,7 @@ class RecentPlaces:
                 windows.
         """
         view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
-        clouds = [(k, self._around(k)) for k in self._order(expected)[:CANDIDATES]]
+        clouds = [(k, self._around(k)) for k in self._order(expected)[:NEAREST]]
         for share in WINDOWS:
             for centre, cloud in clouds:
                 rng = np.random.default_rng([self._config.seed, keyframe.frame_id, centre.kf_id])
@@ -64,7 +61,7 @@ class RecentPlaces:
 
     def _around(self, centre: Keyframe) -> Cloud:
         if centre.kf_id not in self._clouds:
-            others = sorted(self._keyframes, key=lambda k: (abs(k.kf_id - centre.kf_id), k.kf_id))[1 : 1 + NEIGHBOURS]
+            others = sorted(self._keyframes, key=lambda k: (abs(k.kf_id - centre.kf_id), k.kf_id))[1 : 1 + NEAREST]
             self._clouds[centre.kf_id] = gather(centre, others, self._rig, self._config.disparity_sigma_px)
         return self._clouds[centre.kf_id]
 
@@ -75,16 +72,17 @@ class RecentPlaces:
         rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance_bits, window)
         corner = view.corner[rows_b]
         matches = pair(view, cloud, rows_b[corner], rows_a[corner])
-        start = ransac_pose(matches, rig, rng, PIXEL_SIGMA, config.ransac_iterations)
+        sigma_px = 2 * config.sigma_px  # of a corner matched from a distant view
+        start = ransac_pose(matches, rig, rng, sigma_px)
         if start is None:
             return None
-        pose = refine_pose(start, matches, rig, PIXEL_SIGMA)
-        enough = pose.inlier.sum() >= max(MIN_INLIERS, MIN_INLIER_SHARE * len(matches))
+        pose = refine_pose(start, matches, rig, sigma_px)
+        enough = pose.inlier.sum() >= max(MIN_INLIERS, MIN_INLIER_SHARE * matches.size)
         return pose.b_T_a if enough else None
 
     def _order(self, expected: F64) -> list[Keyframe]:
         def difference(keyframe: Keyframe) -> tuple[float, int]:
             metres, radians = se3.extent(se3.inverse(keyframe.odom_T_cam) @ expected)
-            return float(metres + METRES_PER_RADIAN * radians), -keyframe.kf_id
+            return float(metres + 2 * radians), -keyframe.kf_id  # 2 m change the view as much as a radian
 
         return sorted(self._keyframes, key=difference)

@@ -30,7 +30,7 @@ def sideways_config(config: LoopConfig) -> LoopConfig:
         min_match_fraction=0.0,
         min_inliers=config.side_inliers,
         min_inlier_share=0.0,
-        min_cells=config.side_cells,
+        min_cells=config.fewer_cells,
     )
 
 

@@ -24,6 +24,7 @@ GUIDED = (12.0, 4), (6.0, 10)  # rounds of guided matching: radius of the search
 FIRST_SHARE = 0.2  # of the required matches that the candidate alone must have
 RANSAC_SHARE = 0.4  # of the required inliers that the pose from three points must already have
 GRID = (8, 6)  # columns, rows
+CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ def rejection(reason: str, inliers: int = 0) -> Verdict:
 def looks_alike(view: PlaceView, candidate: Keyframe, config: LoopConfig) -> bool:
     """Whether a camera's corners match those of one keyframe well enough to gather the points around it."""
     descriptors = view.descriptors[view.corner]
-    matched, _, _ = binary.match_descriptors(
+    matched, _ = binary.match_descriptors(
         descriptors, candidate.corners.descriptors, None, config.max_distance_bits, config.match_ratio
     )
     return len(matched) >= FIRST_SHARE * config.min_match_fraction * len(descriptors)
@@ -63,7 +64,7 @@ def verify(
         move_points: finish with a bundle adjustment of the points too (stereo points are noisy, map points less so).
     """
     corners_b, corners_a = np.flatnonzero(view.corner), np.flatnonzero(cloud.corner)
-    at_b, at_a, _ = binary.match_descriptors(
+    at_b, at_a = binary.match_descriptors(
         view.descriptors[corners_b],
         cloud.descriptors[corners_a],
         cloud.ids[corners_a],
@@ -74,7 +75,7 @@ def verify(
     if len(rows_b) < max(config.min_match_fraction * len(corners_b), 4):
         return rejection("too_few_matches", len(rows_b))
     matches = pair(view, cloud, rows_b, rows_a)
-    start = ransac_pose(matches, rig, rng, config.sigma_px, config.ransac_iterations)
+    start = ransac_pose(matches, rig, rng, config.sigma_px)
     if start is None:
         return rejection("no_pose")
     agree = int(consistent(start, matches, rig, config.sigma_px).sum())

@@ -1,7 +1,4 @@
-"""Vocabulary tree over binary descriptors: train, look up, grow (Galvez-Lopez & Tardos, T-RO 28, 2012).
-
-A word is a leaf. Word ids never change: growing splits leaves and appends new ids, so bags made before stay valid.
-"""
+"""Vocabulary tree over binary descriptors: train, look up (Galvez-Lopez & Tardos, T-RO 28, 2012). A word is a leaf."""
 
 from __future__ import annotations
 
@@ -15,8 +12,6 @@ import numpy as np
 from stereo_sfm.geometry.hamming import U64, as_words
 from stereo_sfm.loop import binary
 from stereo_sfm.types import F32, I32, I64, U8
-
-MIN_DISTANCE_NEW_WORD = 40  # bits from its word above which a descriptor is new to the vocabulary
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +44,14 @@ class Vocabulary:
         """Number of words."""
         return len(self.idf)
 
-    def look_up(self, descriptors: U8) -> tuple[I32, I32]:
-        """(N, 32) -> word ids (N,), -1 for zero rows, and the distance to the word's centre in bits."""
-        node, distance = binary.descend(as_words(descriptors), self.centroids, self.first_child, self.child_count)
-        return np.where(binary.present(descriptors), self.word[node], -1).astype(np.int32), distance
+    def look_up(self, descriptors: U8) -> I32:
+        """(N, 32) -> word ids (N,), -1 for zero rows."""
+        node = binary.descend(as_words(descriptors), self.centroids, self.first_child, self.child_count)
+        return np.where(binary.present(descriptors), self.word[node], -1).astype(np.int32)
 
     def words(self, descriptors: U8) -> tuple[I32, I64]:
         """(N, 32) of an image -> its words (W,), ascending, and how often it has each (W,)."""
-        ids, _ = self.look_up(descriptors)
+        ids = self.look_up(descriptors)
         words, counts = np.unique(ids[ids >= 0], return_counts=True)
         return words, counts
 
@@ -70,12 +65,6 @@ class Vocabulary:
         total = float(weights.sum())
         keep = weights > 0
         return Bag(words[keep].astype(np.int32), (weights[keep] / max(total, 1e-12)).astype(np.float32))
-
-
-def score(a: Bag, b: Bag) -> float:
-    """L1 score in [0, 1]: 1 - |a - b|_1 / 2, which for positive weights is the sum of the common minima."""
-    _, ia, ib = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
-    return float(np.minimum(a.weights[ia], b.weights[ib]).sum())
 
 
 def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int = 0) -> Vocabulary:
@@ -141,42 +130,3 @@ def counted(vocabulary: Vocabulary, images: Sequence[I32]) -> Vocabulary:
     """
     seen = _images_with(len(vocabulary), images)
     return dataclasses.replace(vocabulary, idf=np.log((len(images) + 1) / np.maximum(seen, 1)).astype(np.float32))
-
-
-def grow(
-    vocabulary: Vocabulary, descriptors: U8, branching: int = 10, min_distance: int = MIN_DISTANCE_NEW_WORD
-) -> Vocabulary:
-    """Split the leaves that new descriptors fall far from; the old centre stays as a child and keeps its word id.
-
-    Args:
-        descriptors: (N, 32) of a new environment, one view of each point is enough.
-        min_distance: bits from the nearest word above which a descriptor needs a new word.
-
-    Returns:
-        The grown vocabulary (the same object if no word was added). A new word gets its parent word's idf.
-    """
-    words = as_words(descriptors)
-    node, distance = binary.descend(words, vocabulary.centroids, vocabulary.first_child, vocabulary.child_count)
-    far = np.flatnonzero(binary.present(descriptors) & (distance > min_distance)).astype(np.int32)
-    if not len(far):
-        return vocabulary
-    centroids, first_child = [vocabulary.centroids], vocabulary.first_child.copy()
-    child_count, word = vocabulary.child_count.copy(), vocabulary.word.copy()
-    new_word, new_idf, total, known = [], [], len(vocabulary.word), len(vocabulary)
-    for leaf in np.unique(node[far]):
-        members = far[node[far] == leaf]
-        centres, _ = binary.k_majority(words, members, branching - 1, np.random.default_rng(int(leaf)))
-        first_child[leaf], child_count[leaf] = total, 1 + len(centres)
-        centroids += [vocabulary.centroids[[leaf]], centres]
-        new_word += [int(word[leaf]), *range(known, known + len(centres))]
-        new_idf += [vocabulary.idf[word[leaf]]] * len(centres)
-        word[leaf] = -1
-        total, known = total + 1 + len(centres), known + len(centres)
-    extra = total - len(vocabulary.word)
-    return Vocabulary(
-        np.concatenate(centroids),
-        np.concatenate([first_child, np.zeros(extra, np.int32)]),
-        np.concatenate([child_count, np.zeros(extra, np.int32)]),
-        np.concatenate([word, np.array(new_word, np.int32)]),
-        np.concatenate([vocabulary.idf, np.array(new_idf, np.float32)]),
-    )

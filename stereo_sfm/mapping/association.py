@@ -16,8 +16,10 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.mapping import map_kernels
+from stereo_sfm.mapping.culling import OF_A_VIEW
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_only import adjust_pose
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, I64, U8, Bool
 
 MATCH_HUBER = 1.5  # sigmas where the loss of a match becomes linear
@@ -47,7 +49,7 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     pose = map_.keyframes.map_T_kf[alive]
     metres = np.linalg.norm(pose[:, :3, 3] - map_T_kf[:3, 3], axis=1)
     near = np.flatnonzero((metres < reach) & (pose[:, :3, 2] @ map_T_kf[:3, 2] > 0.5))
-    near = alive[near[np.argsort(metres[near], kind="stable")]][: config.near_keyframes]
+    near = alive[near[np.argsort(metres[near], kind="stable")]][: 2 * OF_A_VIEW]
     return np.unique(np.concatenate([first, *second, near]).astype(np.int64))
 
 
@@ -57,11 +59,9 @@ def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[
     rows = map_.points_of_keyframes(keyframes)
     rows = rows[points.alive[rows] & np.isfinite(points.xyz[rows, 0])]
     uv_left, uv_right = np.empty((2, len(rows), 2))
-    right = rig.left if rig.right is None else rig.right
     map_kernels.predict(
         points.xyz[rows], map_.keyframes.map_T_kf[points.anchor[rows], :3, 3], map_T_kf, se3.inverse(map_T_kf),
-        se3.inverse(rig.left_T_right), (rig.left.model_id, rig.left.params, right.model_id, right.params),
-        uv_left, uv_right,
+        StereoCameras.of_any(rig), uv_left, uv_right,
     )  # fmt: skip
     visible = rig.left.inside(uv_left, 2.0)
     if rig.right is None:

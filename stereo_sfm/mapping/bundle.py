@@ -18,10 +18,12 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
+from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping import bundle_kernels as kernels
 from stereo_sfm.mapping.level import Level
 from stereo_sfm.mapping.motion_factors import MotionFactors, MotionModel
 from stereo_sfm.mapping.reduced import ReducedSystem
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, I64, Bool
 
 LONGEST_STEP = 32.0  # of those that `BundleConfig.extend` tries, in steps of Gauss-Newton
@@ -66,6 +68,7 @@ class Bundle:
     level: Level | None = None  # what the keyframes measured of gravity; None: nothing
     motions: MotionFactors | None = None  # what IMU and wheels measured between them; None: nothing
     kf_rig: I64 | None = None  # (K,) which of several rigs took a keyframe; None: there is one
+    points_stay: bool = False  # only poses are adjusted
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,17 +96,6 @@ class _Prior:
     cost: float
 
 
-class _OneRig:
-    """A rig for the kernels, and the rows of a table that it took."""
-
-    def __init__(self, rig: Rig, rows: I64 | slice) -> None:
-        right = rig.right if rig.right is not None else rig.left
-        right_T_left = se3.inverse(rig.left_T_right)
-        self.rows, self.stereo = rows, rig.stereo
-        self.cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
-        self.right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
-
-
 class _Table:
     """Observations of the moving or of the fixed keyframes, sorted by point, in columns for the kernels."""
 
@@ -112,16 +104,21 @@ class _Table:
         self.kf = np.ascontiguousarray(bundle.obs_kf[rows], np.int64)
         self.pt = np.ascontiguousarray(bundle.obs_pt[rows], np.int64)
         self.starts = np.searchsorted(self.pt, np.arange(len(bundle.points) + 1))
-        self._left = np.ascontiguousarray(bundle.uv_left[rows], float)
-        self._right = np.ascontiguousarray(bundle.uv_right[rows], float)
+        left = np.ascontiguousarray(bundle.uv_left[rows], float)
+        right = np.ascontiguousarray(bundle.uv_right[rows], float)
         which = None if bundle.kf_rig is None else bundle.kf_rig[self.kf]
-        self._rigs = [_OneRig(rig, slice(None) if which is None else which == i) for i, rig in enumerate(rigs)]
-        finite = np.isfinite(self._left)  # by columns: numpy takes ten times as long to reduce rows of two
-        seen = np.stack([finite[:, 0] & finite[:, 1], np.isfinite(self._right[:, 0])], 1)
-        for rig in self._rigs:
-            seen[rig.rows, 1] &= rig.stereo
+        of_rig = [slice(None) if which is None else which == i for i in range(len(rigs))]
+        finite = np.isfinite(left)  # by columns: numpy takes ten times as long to reduce rows of two
+        seen = np.stack([finite[:, 0] & finite[:, 1], np.isfinite(right[:, 0])], 1)
+        for rig, own in zip(rigs, of_rig, strict=True):
+            seen[own, 1] &= rig.stereo
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
         self._weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
+        columns = kernels.Rows(self.kf, self.pt, left, right, self._weights)
+        self._rigs = [  # of each: its rows, and their columns
+            (own, kernels.Rows._make(column[own] for column in columns), StereoCameras.of_any(rig))
+            for rig, own in zip(rigs, of_rig, strict=True)
+        ]
         self.trust = np.ones(len(bundle.points))  # (P,) factor of the loss of the points' disparities
         self.use = seen.copy()  # (M, 2) images that count
         self._config = config
@@ -133,30 +130,23 @@ class _Table:
         n, cost = len(self.kf), 0.0
         out: Linear = (np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2)))
         scale, redescends = self.cauchy or float(self._config.huber), self.cauchy > 0
-        for rig in self._rigs:
-            use, of_rig = self.use[rig.rows], tuple(column[rig.rows] for column in out)
+        for own, rows, cameras in self._rigs:
+            use, of_rig = self.use[own], tuple(column[own] for column in out)
             cost += kernels.linearize(
-                *(state.rot, state.pos, state.points, *self._columns(rig)),
-                *(self.trust, use, self.limit, rig.cams, *rig.right_T_left, scale),
-                *(redescends, self._config.joint_loss, of_rig),
+                *(state.rot, state.pos, state.points, rows, self.trust, use, self.limit, cameras),
+                *(scale, redescends, self._config.joint_loss, of_rig),
             )
-            self.use[rig.rows] = use  # of several rigs, the rows are copies
+            self.use[own] = use  # of several rigs, the rows are copies
             for column, part in zip(out, of_rig, strict=True):
-                column[rig.rows] = part
+                column[own] = part
         self.limit = 0.0
         return out, float(cost)
 
-    def _columns(self, rig: _OneRig) -> tuple[I64, I64, F64, F64, F64]:
-        """Keyframes, points, left and right pixels, weights of a rig's rows."""
-        rows = rig.rows
-        return self.kf[rows], self.pt[rows], self._left[rows], self._right[rows], self._weights[rows]
-
     def add_disparity_errors(self, state: _State, total: F64, information: F64) -> None:
         """Add the weighted disparity errors of the points' observations, and their weights, to (P,) and (P,)."""
-        for rig in self._rigs:
+        for own, rows, cameras in self._rigs:
             kernels.add_disparity_errors(
-                *(state.rot, state.pos, state.points, *self._columns(rig)),
-                *(self.use[rig.rows], rig.cams, *rig.right_T_left, total, information),
+                state.rot, state.pos, state.points, rows, self.use[own], cameras, total, information
             )
 
     def sum_up(self, rot: F64, lin: Linear) -> tuple[F64, F64]:
@@ -192,6 +182,7 @@ class _Solver:
         self.fixed = _Table(rigs, bundle, config, np.flatnonzero(~moves))
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
+        self.points_stay = bundle.points_stay
         self.level = bundle.level
         self.motions = bundle.motions
         self.model: MotionModel | None = None  # of the round
@@ -266,8 +257,11 @@ class _Solver:
         diagonal += damping * diagonal + 1e-12
         return h, b
 
-    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64]) -> F64 | None:
+    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64] | None) -> F64 | None:
         h, b = self._pose_system(state, damping)
+        if blocks is None:  # nothing couples the poses
+            xi, factor = np.zeros(b.shape), np.zeros((6, 6))
+            return xi if all(solve_symmetric(h[k], b[k], xi[k], factor) for k in range(len(h))) else None
         table = self.table
         if self.system is None:
             dense = self.config.dense if self.model is None else True  # which motions couple as well
@@ -292,7 +286,7 @@ class _Solver:
     def step(self, state: _State, damping: float) -> _State | None:
         """The state after one damped step, or None if the system has no solution."""
         rot, pos, points = state.rot, state.pos, state.points
-        blocks = self._point_blocks(state, damping)
+        blocks = None if self.points_stay else self._point_blocks(state, damping)
         xi = np.zeros((0, 6))
         if len(self.moving):
             solved = self._solve_poses(state, damping, blocks)
@@ -300,8 +294,10 @@ class _Solver:
                 return None
             xi, rot, pos = solved, rot.copy(), pos.copy()
             kernels.move_poses(self.moving, xi, rot, pos)
-        points, table = np.empty_like(points), self.table
-        kernels.point_steps(table.starts, table.kf, self.free, state.rot, state.lin, *blocks, xi, state.points, points)
+        if blocks is not None:
+            points, table = np.empty_like(points), self.table
+            view = table.starts, table.kf, self.free, state.rot, state.lin
+            kernels.point_steps(*view, *blocks, xi, state.points, points)
         return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
     def _extended(self, state: _State, trial: _State) -> _State:

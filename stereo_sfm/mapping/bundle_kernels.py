@@ -23,12 +23,14 @@ arithmetic on it.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
-from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
+from stereo_sfm.geometry.se3_kernels import compose_into, exp_into, transform_point
 from stereo_sfm.mapping.block_product import subtract_product
+from stereo_sfm.types import F64, I64
 
 UNPROJECTABLE = 1e6  # chi2 of a point outside the camera's field of view: without gradient, so such steps are rejected
 
@@ -69,35 +71,24 @@ def _project(model, params, x, y, z, u_obs, v_obs, w):
     return w * j00, w * j01, w * j02, w * j10, w * j11, w * j12, ru, rv, ru * ru + rv * rv
 
 
+class Rows(NamedTuple):
+    """Observations, in columns."""
+
+    kf: I64  # (M,)
+    pt: I64  # (M,)
+    uv_left: F64  # (M, 2) px
+    uv_right: F64  # (M, 2) px
+    weights: F64  # (M, 2) 1/px of either image, 0 where not observed
+
+
 @njit
-def linearize(
-    rot,
-    pos,
-    points,
-    obs_kf,
-    obs_pt,
-    uv_left,
-    uv_right,
-    weights,
-    trust,
-    use,
-    limit,
-    cams,
-    right_r,
-    right_t,
-    scale,
-    redescends,
-    joint,
-    out,
-):
+def linearize(rot, pos, points, rows, trust, use, limit, cameras, scale, redescends, joint, out):
     """Residuals and their quadratic model at one state.
 
     Args:
-        rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world.
-        obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either image, 0 where not observed.
+        rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world. rows: Rows. cameras: StereoCameras.
         trust: (P,) factor of the loss of a point's right images, if joint of both.
         use: (M, 2) images that count. limit: if above 0, `use` is set here to those whose chi2 is not above it.
-        cams: (left model, left params, right model, right params). right_r, right_t: right_T_left.
         scale, redescends: of the loss, see `_loss`. joint: one loss over both images instead of one each.
         out: (A (M, 6) upper triangle, g (M, 3), p (M, 3), chi2 (M, 2)), overwritten; chi2 also of images that do not
             count.
@@ -105,12 +96,12 @@ def linearize(
     Returns:
         The robust cost, sum of rho(chi2) with rho(e^2) = e^2 / 2 near zero.
     """
-    left_model, left_params, right_model, right_params = cams
+    obs_kf, obs_pt, uv_left, uv_right, weights = rows
     a, g, p, chi2 = out
-    r00, r01, r02 = right_r[0, 0], right_r[0, 1], right_r[0, 2]
-    r10, r11, r12 = right_r[1, 0], right_r[1, 1], right_r[1, 2]
-    r20, r21, r22 = right_r[2, 0], right_r[2, 1], right_r[2, 2]
-    t0, t1, t2 = right_t[0], right_t[1], right_t[2]
+    t = cameras.right_T_left
+    r00, r01, r02, t0 = t[0, 0], t[0, 1], t[0, 2], t[0, 3]
+    r10, r11, r12, t1 = t[1, 0], t[1, 1], t[1, 2], t[1, 3]
+    r20, r21, r22, t2 = t[2, 0], t[2, 1], t[2, 2], t[2, 3]
     cost = 0.0
     for o in range(obs_kf.shape[0]):
         k, i = obs_kf[o], obs_pt[o]
@@ -120,13 +111,13 @@ def linearize(
         p2 = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
         p[o, 0], p[o, 1], p[o, 2] = p0, p1, p2
         x0, x1, x2, y0, y1, y2, ru, rv, chi_l = _project(
-            left_model, left_params, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], weights[o, 0]
+            cameras.model_l, cameras.params_l, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], weights[o, 0]
         )
         q0 = r00 * p0 + r01 * p1 + r02 * p2 + t0
         q1 = r10 * p0 + r11 * p1 + r12 * p2 + t1
         q2 = r20 * p0 + r21 * p1 + r22 * p2 + t2
         u0, u1, u2, v0, v1, v2, su, sv, chi_r = _project(
-            right_model, right_params, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], weights[o, 1]
+            cameras.model_r, cameras.params_r, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], weights[o, 1]
         )
         u0, u1, u2 = u0 * r00 + u1 * r10 + u2 * r20, u0 * r01 + u1 * r11 + u2 * r21, u0 * r02 + u1 * r12 + u2 * r22
         v0, v1, v2 = v0 * r00 + v1 * r10 + v2 * r20, v0 * r01 + v1 * r11 + v2 * r21, v0 * r02 + v1 * r12 + v2 * r22
@@ -158,18 +149,17 @@ def linearize(
 
 
 @njit
-def add_disparity_errors(
-    rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, use, cams, right_r, right_t, total, information
-):
+def add_disparity_errors(rot, pos, points, rows, use, cameras, total, information):
     """Add, by point, the weighted disparity errors of its observations in both images.
 
     The error is the right pixel's residual less the left one's, along the epipolar curve, positive towards nearer.
 
     Args:
-        rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, use, cams, right_r, right_t: as of `linearize`.
+        rot, pos, points, rows, use, cameras: as of `linearize`.
         total (P,), information (P,): the sums of weight^2 times error, and of weight^2, are added.
     """
-    left_model, left_params, right_model, right_params = cams
+    obs_kf, obs_pt, uv_left, uv_right, weights = rows
+    t = cameras.right_T_left
     for o in range(obs_kf.shape[0]):
         if not (use[o, 0] and use[o, 1]):
             continue
@@ -178,18 +168,15 @@ def add_disparity_errors(
         p0 = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
         p1 = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
         p2 = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
-        left = project_one(left_model, left_params, p0, p1, p2)
-        q0 = right_r[0, 0] * p0 + right_r[0, 1] * p1 + right_r[0, 2] * p2 + right_t[0]
-        q1 = right_r[1, 0] * p0 + right_r[1, 1] * p1 + right_r[1, 2] * p2 + right_t[1]
-        q2 = right_r[2, 0] * p0 + right_r[2, 1] * p1 + right_r[2, 2] * p2 + right_t[2]
-        right = project_one(right_model, right_params, q0, q1, q2)
+        left = project_one(cameras.model_l, cameras.params_l, p0, p1, p2)
+        right = project_one(cameras.model_r, cameras.params_r, *transform_point(t, p0, p1, p2))
         if not (math.isfinite(left[0]) and math.isfinite(right[0])):
             continue
-        du = right[2] * right_t[0] + right[3] * right_t[1] + right[4] * right_t[2]
+        du = right[2] * t[0, 3] + right[3] * t[1, 3] + right[4] * t[2, 3]
         error = du * (uv_right[o, 0] - right[0] - uv_left[o, 0] + left[0])
         square = du * du
         if math.isfinite(uv_right[o, 1]):
-            dv = right[5] * right_t[0] + right[6] * right_t[1] + right[7] * right_t[2]
+            dv = right[5] * t[0, 3] + right[6] * t[1, 3] + right[7] * t[2, 3]
             error += dv * (uv_right[o, 1] - right[1] - uv_left[o, 1] + left[1])
             square += dv * dv
         if square > 0:

@@ -8,22 +8,28 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
-
-
 SPARE = 4  # one spare row for so many in use: rows are copied four times on the way, and little memory is unused
 
 
+def column(dtype: DTypeLike, default: Any, shape: tuple[int, ...] = ()) -> Any:
+    """A column of a table: numbers of a type, the value of a new row, the shape of one value."""
+    return dtype, shape, default
+
+
 class Columns:
-    """Rows in arrays. A subclass names its columns in SPEC, (dtype, shape of one value, value of a new row).
+    """Rows in arrays. A subclass names its columns, each as an attribute that is a `column`.
 
     `table.name` is a view (rows, ...) of the column that may be written to; it is valid until rows are appended.
     """
 
-    SPEC: ClassVar[Spec] = {}
+    spec: ClassVar[Spec] = {}
+
+    def __init_subclass__(cls) -> None:
+        cls.spec = {name: value for name, value in vars(cls).items() if isinstance(value, tuple)}
 
     def __init__(self, capacity: int = 64) -> None:
         self._count = 0
-        self._data = {name: np.empty((capacity, *shape), dtype) for name, (dtype, shape, _) in self.SPEC.items()}
+        self._data = {name: np.empty((capacity, *shape), dtype) for name, (dtype, shape, _) in self.spec.items()}
         self._show()
 
     def __len__(self) -> int:
@@ -41,7 +47,7 @@ class Columns:
                 grown = np.empty((max(last, first + first // SPARE, 64), *data.shape[1:]), data.dtype)
                 grown[:first] = data[:first]
                 self._data[name] = data = grown
-            data[first:last] = values.pop(name) if name in values else self.SPEC[name][2]
+            data[first:last] = values.pop(name) if name in values else self.spec[name][2]
         if values:
             raise TypeError(f"no such columns: {', '.join(values)}")
         self._count = last

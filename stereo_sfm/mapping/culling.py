@@ -12,6 +12,10 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
 OTHERS = 3  # keyframes that observe a point, beyond which one more is redundant
+# Keyframes that stay of those that see the same, in the map and among the loop closer's candidates: they bound memory
+# and time where the robot does not leave a place.
+OF_A_VIEW, OF_EARLIER_VISITS = 5, 300  # of one view; besides, of all views that earlier visits had
+PASSED = 30  # newest keyframes, which are not counted yet: the camera may still be there
 SAME_VIEW_DEPTHS, SAME_VIEW_DEG = 0.15, 15.0  # keyframes of the same view: distance in median depths, angle
 
 
@@ -24,7 +28,7 @@ def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfi
     points = map_.points
     rows = rows[points.alive[rows]]
     lost = points.last_seen[rows] < newest
-    few = lost & (points.obs_count[rows] < config.min_observations)
+    few = lost & (points.obs_count[rows] < 2)
     error, parallax = _quality(map_, rig, rows)
     bad = (error > config.max_error_sigmas) & (points.obs_count[rows] >= 2)
     narrow = lost & (parallax < np.deg2rad(config.min_parallax_deg))
@@ -37,8 +41,8 @@ def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
     table, points, pose = map_.observations, map_.points, map_.keyframes.map_T_kf
     out = np.empty((len(rows), 2))
     map_kernels.judge_points(
-        rows, points.head, table.following, table.kf, table.uv_left, table.uv_right, table.sigma, pose[:, :3, :3],
-        pose[:, :3, 3], points.xyz, rig.left.model_id, rig.left.params, rig.baseline, out,
+        rows, map_.lists, table.uv_left, table.uv_right, table.sigma, pose[:, :3, :3], pose[:, :3, 3], points.xyz,
+        rig.left.model_id, rig.left.params, rig.baseline, out,
     )  # fmt: skip
     return out[:, 0], out[:, 1]
 
@@ -47,8 +51,8 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
     """A redundant neighbour of the newest keyframe, -1: none.
 
     The oldest one whose points are seen well enough by others; else, in a place that the robot visits often, the one
-    of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes. Of
-    each view one by which places are recognised stays.
+    of several with the same view whose points are seen best by others: a view keeps OF_A_VIEW keyframes. Of each view
+    one by which places are recognised stays.
 
     Args:
         protected: (K,) keyframes that must stay (the first and the newest ones). earlier: see `earlier_visits`.
@@ -62,7 +66,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
         if not _alone_described(map_, row, config):
             return row
     same = np.union1d(neighbours[_same_view(map_, newest, neighbours)], earlier)
-    if len(same) <= config.crowd_keyframes:
+    if len(same) <= OF_A_VIEW:
         return -1
     plain = same[~_described(map_, same)]
     same = plain if len(plain) else same
@@ -130,7 +134,7 @@ def _seen_by_others(map_: Map, rows: I64) -> F64:
 def _same_view(map_: Map, newest: int, rows: I64) -> Bool:
     """(N,) which keyframes have about the pose of the newest."""
     poses = map_.keyframes.map_T_kf
-    pts = map_.observations.pt[map_.observations_of_keyframe(newest)]
+    pts = map_.seen_by(newest)
     depth = np.nanmedian(np.linalg.norm(map_.points.xyz[pts] - poses[newest, :3, 3], axis=1)) if len(pts) else 0.0
     metres, radians = se3.extent(se3.inverse(poses[rows]) @ poses[newest])
     return (metres < SAME_VIEW_DEPTHS * depth) & (radians < np.deg2rad(SAME_VIEW_DEG))

@@ -10,6 +10,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import association
+from stereo_sfm.mapping.culling import SAME_VIEW_DEPTHS
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.pose_only import adjust_pose
@@ -93,7 +94,7 @@ def _find_again(
     """(M, 2) pairs (row of the keyframe, point row) that match by descriptor near the point's projection."""
     tracked = rows[usable & (rows >= 0)]
     depth = np.linalg.norm(keyframe.points_cam, axis=1)
-    reach = config.near_depths * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
+    reach = 2 * SAME_VIEW_DEPTHS * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
     around = association.local_keyframes(map_, tracked, pose, reach, config)
     points, uv_left, uv_right = association.points_in_view(map_, rig, around, pose)
     followed = np.zeros(len(map_.points), bool)

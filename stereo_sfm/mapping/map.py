@@ -152,6 +152,16 @@ class Map:
         rows = np.arange(first, first + int(self.keyframes.obs_count[row]))
         return rows[self.observations.pt[rows] >= 0]
 
+    @property
+    def lists(self) -> map_kernels.Lists:
+        """The points' lists of observations, valid until a table grows."""
+        table = self.observations
+        return map_kernels.Lists(self.points.head, table.following, table.kf, table.pt)
+
+    def seen_by(self, row: int) -> I64:
+        """Rows of the points that a keyframe observes."""
+        return self.observations.pt[self.observations_of_keyframe(row)].astype(np.int64)
+
     def points_of_keyframes(self, rows: I64) -> I64:
         """Rows of the points that any of the keyframes observes, ascending."""
         seen, keyframes = np.zeros(len(self.points), np.bool_), self.keyframes
@@ -162,27 +172,21 @@ class Map:
     def count_by_keyframe(self, points: I64) -> I64:
         """(K,) number of the points that each keyframe observes."""
         counts = np.zeros(len(self.keyframes), np.int64)
-        points = np.ascontiguousarray(points, np.int64)
-        table = self.observations
-        map_kernels.count_by_keyframe(points, self.points.head, table.following, table.kf, counts)
+        map_kernels.count_by_keyframe(np.ascontiguousarray(points, np.int64), self.lists, counts)
         return counts
 
     def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
         """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, then oldest first."""
-        keyframes, table = self.keyframes, self.observations
-        rows, counts = map_kernels.shared(
-            row, at_least, keyframes.obs_first, keyframes.obs_count, self.points.head, table.following, table.pt,
-            table.kf,
-        )  # fmt: skip
+        keyframes = self.keyframes
+        rows, counts = map_kernels.shared(row, at_least, keyframes.obs_first, keyframes.obs_count, self.lists)
         order = np.argsort(rows - counts * len(keyframes))
         return rows[order], counts[order]
 
     def observations_of_points(self, rows: I64) -> I64:
         """Rows of all observations of some points, ascending."""
         rows = np.ascontiguousarray(rows, np.int64)
-        head, following = self.points.head, self.observations.following
-        out = np.empty(map_kernels.count_listed(rows, head, following), np.int64)
-        map_kernels.list_observations(rows, head, following, out)
+        out = np.empty(int(self.points.obs_count[rows].sum()), np.int64)
+        map_kernels.list_observations(rows, self.lists, out)
         return np.sort(out)
 
     def descriptors_of(self, rows: I64) -> U8:
@@ -251,7 +255,7 @@ class Map:
             sigma=self.points.sigma[pt_rows],
             descriptor=descriptors,
         )
-        map_kernels.link(rows.start, self.points.head, self.observations.following, self.observations.pt)
+        map_kernels.link(rows.start, self.lists)
         self.keyframes.obs_count[kf] += len(pt_rows)
         self.points.obs_count[pt_rows] += 1
         self.points.seen[pt_rows] += 1
@@ -264,11 +268,11 @@ class Map:
     def _move_to_end(self, kf: int) -> None:
         """Move the observations of a keyframe to the end of the table, where more can follow."""
         table, rows = self.observations, self.observations_of_keyframe(kf)
-        columns = {name: getattr(table, name)[rows] for name in table.SPEC if name != "following"}
+        columns = {name: getattr(table, name)[rows] for name in table.spec if name != "following"}
         standing = self.points.descriptor_obs[columns["pt"]] == rows
-        map_kernels.unlink(rows, self.points.head, table.following, table.pt)
+        map_kernels.unlink(rows, self.lists)
         made = table.append(len(rows), **columns)
-        map_kernels.link(made.start, self.points.head, table.following, table.pt)
+        map_kernels.link(made.start, self.lists)
         self.points.descriptor_obs[columns["pt"][standing]] = np.arange(made.start, made.stop)[standing]
         self.keyframes.obs_first[kf], self.keyframes.obs_count[kf] = made.start, len(rows)
 
@@ -315,16 +319,9 @@ class Map:
         if not len(rows):
             return
         points = table.pt[rows].astype(np.int64)
-        map_kernels.unlink(rows, self.points.head, table.following, table.pt)
+        map_kernels.unlink(rows, self.lists)
         np.subtract.at(self.points.obs_count, points, 1)
-        self._renew_descriptors(np.unique(points))
-
-    def _renew_descriptors(self, points: I64) -> None:
-        """Points whose standing observation is gone take the newest that has a descriptor."""
-        head, table = self.points.head, self.observations
-        map_kernels.renew_standing(
-            points, head, table.following, table.pt, table.descriptor, self.points.descriptor_obs
-        )
+        map_kernels.renew_standing(np.unique(points), self.lists, table.descriptor, self.points.descriptor_obs)
 
     def cull_points(self, rows: I64) -> None:
         """Cull points with all their observations."""
@@ -347,8 +344,8 @@ class Map:
         del self.corners[row]
         self._join_motions(row)
         self.keyframes.previous[self.keyframes.previous == row] = self.keyframes.previous[row]
-        table, orphans = self.observations, points[self.points.anchor[points] == row]
-        map_kernels.anchor_anew(orphans, self.points.head, table.following, table.kf, self.points.anchor)
+        orphans = points[self.points.anchor[points] == row]
+        map_kernels.anchor_anew(orphans, self.lists, self.points.anchor)
 
     def _join_motions(self, row: int) -> None:
         """The motions to a keyframe and from it become one."""
@@ -380,10 +377,10 @@ class Map:
         """
         points, table = self.points, self.observations
         double = np.empty(int(points.obs_count[old]), np.int64)
-        if count := map_kernels.seen_together(old, new, points.head, table.following, table.kf, double):
+        if count := map_kernels.seen_together(old, new, self.lists, double):
             self.remove_observations(double[:count])
         table.sigma[self.observations_of_points(np.array([old]))] = sigma
-        points.obs_count[new] += map_kernels.hand_over(old, new, points.head, table.following, table.pt)
+        points.obs_count[new] += map_kernels.hand_over(old, new, self.lists)
         points.sigma[new] = sigma
         points.seen[new] += points.seen[old]
         points.expected[new] += points.expected[old]
@@ -395,9 +392,8 @@ class Map:
 
     def share_a_keyframe(self, first: int, second: int) -> bool:
         """Whether one keyframe saw the points of both rows."""
-        points, table = self.points, self.observations
-        both = np.empty(int(points.obs_count[first]), np.int64)
-        return map_kernels.seen_together(first, second, points.head, table.following, table.kf, both) > 0
+        both = np.empty(int(self.points.obs_count[first]), np.int64)
+        return map_kernels.seen_together(first, second, self.lists, both) > 0
 
     # -- memory ------------------------------------------------------------------------------------------------------
 

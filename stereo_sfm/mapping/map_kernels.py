@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,80 +13,78 @@ from stereo_sfm.geometry.hamming import BITS, hamming
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.geometry.se3_kernels import transform_point
+from stereo_sfm.types import I32
+
+
+class Lists(NamedTuple):
+    """The observations of each point as a linked list."""
+
+    head: I32  # (P,) newest observation, -1: none
+    following: I32  # (M,) next older one of the same point, -1: last
+    kf: I32  # (M,) keyframe
+    pt: I32  # (M,) point, -1: removed
 
 
 @njit
-def link(first, head, following, obs_pt):
+def link(first, lists):
     """Puts the observations from row `first` on at the head of their points' lists."""
-    for o in range(first, obs_pt.shape[0]):
-        p = obs_pt[o]
-        following[o] = head[p]
-        head[p] = o
+    for o in range(first, lists.pt.shape[0]):
+        p = lists.pt[o]
+        lists.following[o] = lists.head[p]
+        lists.head[p] = o
 
 
 @njit
-def count_listed(points, head, following):
-    """How many observations these points have together."""
-    total = 0
-    for i in range(points.shape[0]):
-        o = head[points[i]]
-        while o >= 0:
-            total += 1
-            o = following[o]
-    return total
-
-
-@njit
-def list_observations(points, head, following, out):
+def list_observations(points, lists, out):
     """Fills out with the observations of points, point after point, newest first."""
     n = 0
     for i in range(points.shape[0]):
-        o = head[points[i]]
+        o = lists.head[points[i]]
         while o >= 0:
             out[n] = o
             n += 1
-            o = following[o]
+            o = lists.following[o]
 
 
 @njit
-def renew_standing(points, head, following, obs_pt, descriptor, standing):
+def renew_standing(points, lists, descriptor, standing):
     """For points whose `standing` observation (P,) is another point's or removed: the newest that has a descriptor."""
     for p in points:
-        if standing[p] < 0 or obs_pt[standing[p]] == p:
+        if standing[p] < 0 or lists.pt[standing[p]] == p:
             continue
         standing[p] = -1
-        o = head[p]
+        o = lists.head[p]
         while o >= 0:
             if o > standing[p] and descriptor[o].any():
                 standing[p] = o
-            o = following[o]
+            o = lists.following[o]
 
 
 @njit
-def count_by_keyframe(points, head, following, obs_kf, counts):
+def count_by_keyframe(points, lists, counts):
     """Adds to counts (K,) how many of these points every keyframe sees."""
     for i in range(points.shape[0]):
-        o = head[points[i]]
+        o = lists.head[points[i]]
         while o >= 0:
-            counts[obs_kf[o]] += 1
-            o = following[o]
+            counts[lists.kf[o]] += 1
+            o = lists.following[o]
 
 
 @njit
-def shared(row, at_least, first, count, head, following, obs_pt, obs_kf):
+def shared(row, at_least, first, count, lists):
     """(N,) keyframes that share so many points with keyframe `row`, unordered, and (N,) the number of points."""
     counts, found = np.zeros(first.shape[0], np.int64), np.empty(first.shape[0], np.int64)
     n = 0
     for o in range(first[row], first[row] + count[row]):
-        q = head[obs_pt[o]] if obs_pt[o] >= 0 else -1
+        q = lists.head[lists.pt[o]] if lists.pt[o] >= 0 else -1
         while q >= 0:
-            k = obs_kf[q]
+            k = lists.kf[q]
             if k != row:
                 if counts[k] == 0:
                     found[n] = k
                     n += 1
                 counts[k] += 1
-            q = following[q]
+            q = lists.following[q]
     kept = 0
     for i in range(n):
         if counts[found[i]] >= at_least:
@@ -95,66 +94,66 @@ def shared(row, at_least, first, count, head, following, obs_pt, obs_kf):
 
 
 @njit
-def list_sightings(points, head, following, obs_kf, kf_index, obs, pt):
+def list_sightings(points, lists, kf_index, obs, pt):
     """Fills obs and pt with the observations of points by the keyframes whose kf_index is not negative.
 
     Point after point, newest first; pt is the index into points. Returns how many there are.
     """
     n = 0
     for i in range(points.shape[0]):
-        o = head[points[i]]
+        o = lists.head[points[i]]
         while o >= 0:
-            if kf_index[obs_kf[o]] >= 0:
+            if kf_index[lists.kf[o]] >= 0:
                 obs[n], pt[n] = o, i
                 n += 1
-            o = following[o]
+            o = lists.following[o]
     return n
 
 
 @njit
-def unlink(rows, head, following, obs_pt):
+def unlink(rows, lists):
     """Takes observations out of their points' lists."""
     for i in range(rows.shape[0]):
         row = rows[i]
-        p = obs_pt[row]
-        before, o = -1, head[p]
+        p = lists.pt[row]
+        before, o = -1, lists.head[p]
         while o != row:
-            before, o = o, following[o]
+            before, o = o, lists.following[o]
         if before < 0:
-            head[p] = following[row]
+            lists.head[p] = lists.following[row]
         else:
-            following[before] = following[row]
-        obs_pt[row] = -1
+            lists.following[before] = lists.following[row]
+        lists.pt[row] = -1
 
 
 @njit
-def seen_together(old, new, head, following, obs_kf, out):
+def seen_together(old, new, lists, out):
     """Fills out with the observations of point `old` by keyframes that see `new` too. Returns how many there are."""
     n = 0
-    o = head[old]
+    o = lists.head[old]
     while o >= 0:
-        q = head[new]
-        while q >= 0 and obs_kf[q] != obs_kf[o]:
-            q = following[q]
+        q = lists.head[new]
+        while q >= 0 and lists.kf[q] != lists.kf[o]:
+            q = lists.following[q]
         if q >= 0:
             out[n] = o
             n += 1
-        o = following[o]
+        o = lists.following[o]
     return n
 
 
 @njit
-def hand_over(old, new, head, following, obs_pt):
+def hand_over(old, new, lists):
     """Moves the observations of point `old` to the front of the list of `new`. Returns how many there are."""
     moved = 0
-    front, o = head[new], head[old]
+    front, o = lists.head[new], lists.head[old]
     last = -1
     while o >= 0:
-        obs_pt[o] = new
+        lists.pt[o] = new
         moved += 1
-        last, o = o, following[o]
+        last, o = o, lists.following[o]
     if last >= 0:
-        following[last], head[new] = front, head[old]
+        lists.following[last], lists.head[new] = front, lists.head[old]
     return moved
 
 
@@ -169,14 +168,14 @@ def follow(rows, fused_into):
 
 
 @njit
-def anchor_anew(points, head, following, obs_kf, anchor):
+def anchor_anew(points, lists, anchor):
     """Anchors of points: the oldest keyframe that observes them, if any."""
     for i in range(points.shape[0]):
-        o = head[points[i]]
-        oldest = obs_kf[o] if o >= 0 else anchor[points[i]]
+        o = lists.head[points[i]]
+        oldest = lists.kf[o] if o >= 0 else anchor[points[i]]
         while o >= 0:
-            oldest = min(oldest, obs_kf[o])
-            o = following[o]
+            oldest = min(oldest, lists.kf[o])
+            o = lists.following[o]
         anchor[points[i]] = oldest
 
 
@@ -204,7 +203,7 @@ def mark_seen(rows, first, count, obs_pt, marked):
 
 
 @njit
-def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot, pos, xyz, cam, params, base, out):
+def judge_points(points, lists, uv_left, uv_right, sigma, rot, pos, xyz, cam, params, base, out):
     """Fills out (N, 2): root mean squared error of the left images in sigmas, largest angle of a ray to the oldest's.
 
     Args:
@@ -213,23 +212,23 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
     """
     for i in range(points.shape[0]):
         p = points[i]
-        oldest = o = head[p]
+        oldest = o = lists.head[p]
         while o >= 0:
             oldest = min(oldest, o)
-            o = following[o]
+            o = lists.following[o]
         squared, chord, widest, n = 0.0, 0.0, 0.0, 0
         f0 = f1 = f2 = 0.0
         o = oldest
         first = True
         while o >= 0:
-            k = obs_kf[o]
+            k = lists.kf[o]
             d0, d1, d2 = xyz[p, 0] - pos[k, 0], xyz[p, 1] - pos[k, 1], xyz[p, 2] - pos[k, 2]
             distance = max(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-9)
             u0, u1, u2 = d0 / distance, d1 / distance, d2 / distance
             if first:  # the oldest ray, before the list is traversed from its head
                 f0, f1, f2 = u0, u1, u2
                 first = False
-                o = head[p]
+                o = lists.head[p]
                 continue
             x = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
             y = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
@@ -241,21 +240,20 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
             if math.isfinite(uv_right[o, 0]):
                 widest = max(widest, base / distance)
             n += 1
-            o = following[o]
+            o = lists.following[o]
         out[i, 0] = math.sqrt(squared / max(n, 1))
         out[i, 1] = max(2.0 * math.asin(min(math.sqrt(chord) / 2.0, 1.0)), widest)
 
 
 @njit
-def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_right):
+def predict(xyz, anchors, map_T_kf, kf_T_map, cameras, uv_left, uv_right):
     """Fills uv_left and uv_right (N, 2) with the predicted pixels of points in a keyframe; NaN where not recognisable.
 
     Args:
         xyz: (N, 3) in the map. anchors: (N, 3) where the keyframes stood that saw them first: from less than half or
             more than twice that distance, or a direction whose cosine to that one is below 0.8, they look otherwise.
-        cams: (left model, left params, right model, right params).
+        cameras: StereoCameras.
     """
-    left_model, left_params, right_model, right_params = cams
     for i in range(xyz.shape[0]):
         uv_left[i, 0] = uv_left[i, 1] = uv_right[i, 0] = uv_right[i, 1] = math.nan
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
@@ -265,9 +263,9 @@ def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_ri
         if now >= 4.0 * then or then >= 4.0 * now or a0 * b0 + a1 * b1 + a2 * b2 <= 0.8 * math.sqrt(then * now):
             continue
         p0, p1, p2 = transform_point(kf_T_map, x, y, z)
-        uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(left_model, left_params, p0, p1, p2)
-        p0, p1, p2 = transform_point(right_T_left, p0, p1, p2)
-        uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(right_model, right_params, p0, p1, p2)
+        uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(cameras.model_l, cameras.params_l, p0, p1, p2)
+        p0, p1, p2 = transform_point(cameras.right_T_left, p0, p1, p2)
+        uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(cameras.model_r, cameras.params_r, p0, p1, p2)
 
 
 @njit

@@ -71,9 +71,7 @@ from stereo_sfm.types import (
 MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
 FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
 GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
-MOST_AT_ONCE = 40  # keyframes adjusted with a correction of the rig, before all are
 LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
-PASSED = 30  # keyframes after which one that repeats an earlier visit's view is not needed any more
 RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
 
 
@@ -279,9 +277,13 @@ class Mapper:
                 self._rows.use(self._rig)
 
     def _adjust_since(self, first: int) -> None:
-        """Adjust the keyframes from a row on at once: the tracker's next poses are solved with their points."""
-        before = self.map.keyframes.map_T_kf[-1].copy()
-        part = window.newest(self.map, first, MOST_AT_ONCE, self._config, self._rig.imu)
+        """Adjust the keyframes from a row on at once: the tracker's next poses are solved with their points.
+
+        As many as a window has, fixed ones included; a full bundle adjustment follows.
+        """
+        before, config = self.map.keyframes.map_T_kf[-1].copy(), self._config
+        most = config.window_keyframes + config.fixed_keyframes
+        part = window.newest(self.map, first, most, config, self._rig.imu)
         window.write_back(self.map, part, bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config)))
         self._follow_newest(before)
 
@@ -422,7 +424,7 @@ class Mapper:
     def _adjust(self, row: int) -> None:
         if row == 0:
             return
-        seen = self._seen_by(row)
+        seen = self.map.seen_by(row)
         count = self.map.points.obs_count[seen]
         recent = seen[(count > 1) & (count <= MAX_TRIANGULATED)]
         self.map.move_points(recent, triangulate(self.map, self._rig, recent))
@@ -433,7 +435,7 @@ class Mapper:
 
     def _cull(self, row: int) -> None:
         recent = range(max(0, row - RECENT), row + 1)
-        seen = [self._seen_by(k) for k in recent]
+        seen = [self.map.seen_by(k) for k in recent]
         protected = self._protected()
         earlier = culling.earlier_visits(self.map, row, protected)
         redundant = culling.redundant_keyframe(self.map, row, protected, earlier, self._config)
@@ -441,7 +443,7 @@ class Mapper:
             self._repeated.append(row)
         passed = self._one_too_many() if redundant < 0 and self._config.redundant_share <= 1 else -1
         if (gone := max(redundant, passed)) >= 0:
-            seen.append(self._seen_by(gone))
+            seen.append(self.map.seen_by(gone))
             self.map.cull_keyframe(gone)
             if redundant >= 0:
                 self._carry_loops(int(self.map.keyframes.kf_id[gone]))
@@ -452,16 +454,16 @@ class Mapper:
         self.map.cull_points(weak)
         self._culled.append(weak)
         points = self.map.points
-        self._thin = rows[points.alive[rows] & (points.obs_count[rows] < self._config.min_observations)]
+        self._thin = rows[points.alive[rows] & (points.obs_count[rows] < 2)]
 
     def _cull_loose(self) -> None:
         """Cull the keyframes of earlier times that hardly anything holds."""
         if self._config.redundant_share > 1:
             return
-        settled = np.arange(len(self.map.keyframes)) < len(self.map.keyframes) - PASSED
+        settled = np.arange(len(self.map.keyframes)) < len(self.map.keyframes) - culling.PASSED
         self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
         for row in culling.loose_keyframes(self.map, settled, np.array(self._repeated, int), self._config).tolist():
-            self._thin = np.union1d(self._thin, self._seen_by(row))
+            self._thin = np.union1d(self._thin, self.map.seen_by(row))
             self.map.cull_keyframe(row)
             self._carry_loops(int(self.map.keyframes.kf_id[row]))
 
@@ -472,7 +474,7 @@ class Mapper:
         with it: they have joined points, and carried on from keyframe to keyframe they would follow the robot.
         """
         self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
-        passed = self._repeated[self._config.repeated_keyframes : -PASSED]
+        passed = self._repeated[culling.OF_EARLIER_VISITS : -culling.PASSED]
         return next((row for row in passed if not self._joins_submaps(row)), -1)
 
     def _joins_submaps(self, row: int) -> bool:
@@ -481,10 +483,6 @@ class Mapper:
         submaps = [frozenset(int(table.submap_id[self.map.kf_row(k)]) for k in _ends(x)) for x in self._loops]
         own = [s for s, x in zip(submaps, self._loops, strict=True) if len(s) == 2 and kf_id in _ends(x)]
         return any(submaps.count(s) == 1 for s in own)
-
-    def _seen_by(self, row: int) -> I64:
-        """Point rows that a keyframe observes."""
-        return self.map.observations.pt[self.map.observations_of_keyframe(row)].astype(np.int64)
 
     def _protected(self) -> Bool:
         """(K,) keyframes that must stay: the first and the newest."""

@@ -1,82 +1,12 @@
-"""Pose of one keyframe from fixed points: the cost of bundle adjustment for a single pose, in one compiled loop."""
-
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+"""Pose of one keyframe from fixed points: bundle adjustment of a single pose."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
-from stereo_sfm.geometry.small_matrix import solve_symmetric
-from stereo_sfm.mapping.bundle_kernels import linearize, pose_blocks
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.types import F64, Bool
-
-ROUNDS, ITERATIONS = 3, 10
-OUTLIER_CHI2 = 9.21  # squared normalised residual of one image above which it is an outlier (99 % of 2 dof)
-DAMPING, TOLERANCE = 1e-4, 1e-5
-
-
-@njit
-def _model(pose, points, kf, pt, uv_left, uv_right, weights, use, limit, cams, right_r, right_t, huber, lin):
-    """`linearize` of all points from one pose (4, 4); the cost."""
-    rot, pos = np.empty((1, 3, 3)), np.empty((1, 3))
-    for i in range(3):
-        pos[0, i] = pose[i, 3]
-        for k in range(3):
-            rot[0, i, k] = pose[i, k]
-    return linearize(
-        rot, pos, points, kf, pt, uv_left, uv_right, weights, np.ones(points.shape[0]), use, limit, cams, right_r,
-        right_t, huber, False, False, lin,
-    )  # fmt: skip
-
-
-@njit
-def _descend(
-    pose, points, kf, pt, uv_left, uv_right, weights, use, cams, right_r, right_t, huber, rounds, iterations, lin, other
-):
-    """Levenberg-Marquardt on pose (4, 4), in place, without outliers from the second round on.
-
-    Returns:
-        (M, 2) squared normalised residuals in the end.
-    """
-    free, delta, trial = np.zeros(1, np.int64), np.zeros((4, 4)), np.zeros((4, 4))
-    h, b, xi, factor = np.zeros((1, 6, 6)), np.zeros((1, 6)), np.zeros(6), np.zeros((6, 6))
-    for index in range(rounds):
-        limit = OUTLIER_CHI2 if index > 0 else 0.0
-        cost = _model(pose, points, kf, pt, uv_left, uv_right, weights, use, limit, cams, right_r, right_t, huber, lin)
-        damping, accepted = DAMPING, 0
-        while accepted < iterations:
-            for i in range(6):
-                b[0, i] = 0.0
-                for k in range(6):
-                    h[0, i, k] = 0.0
-            pose_blocks(kf, free, lin, h, b)
-            for i in range(6):
-                h[0, i, i] += damping * h[0, i, i] + 1e-12
-            if not solve_symmetric(h[0], b[0], xi, factor):
-                break
-            exp_into(xi, 1.0, delta)
-            compose_into(pose, delta, trial)
-            new = _model(
-                trial, points, kf, pt, uv_left, uv_right, weights, use, 0.0, cams, right_r, right_t, huber, other
-            )
-            if not new <= cost:
-                damping *= 10.0
-                if damping > 1e6 or new - cost <= 0.1 * TOLERANCE * cost:
-                    break
-                continue
-            done = cost - new <= TOLERANCE * cost
-            cost, damping, accepted = new, max(0.1 * damping, 1e-9), accepted + 1
-            lin, other = other, lin
-            for i in range(3):
-                for k in range(4):
-                    pose[i, k] = trial[i, k]
-            if done:
-                break
-    return lin[3]
 
 
 def adjust_pose(
@@ -91,18 +21,10 @@ def adjust_pose(
     Returns:
         (4, 4) pose, and (N, 2) which observations agree with it, in the left and the right image.
     """
-    count, pose = len(points), np.array(world_T_cam, float)
-    seen = np.stack([np.isfinite(uv_left).all(1), np.isfinite(uv_right[:, 0]) & rig.stereo], 1)
-    weights = np.where(seen, 1.0 / np.asarray(sigma, float)[:, None], 0.0)
-    right, right_T_left = rig.right if rig.right is not None else rig.left, se3.inverse(rig.left_T_right)
-    lin, other = (
-        (np.empty((count, 6)), np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2))) for _ in range(2)
-    )
-    chi2 = _descend(
-        *(pose, np.ascontiguousarray(points, float), np.zeros(count, np.int64), np.arange(count)),
-        *(np.ascontiguousarray(uv_left, float), np.ascontiguousarray(uv_right, float), weights, seen.copy()),
-        *((rig.left.model_id, rig.left.params, right.model_id, right.params),),
-        *(np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()),
-        *(float(huber), ROUNDS, ITERATIONS, lin, other),
-    )
-    return se3.orthonormalize(pose), seen & (chi2 <= OUTLIER_CHI2)
+    rows, sigmas = np.arange(len(points)), np.repeat(np.asarray(sigma, float)[:, None], 2, axis=1)
+    bundle = Bundle(
+        np.array(world_T_cam, float)[None], np.zeros(1, bool), points, np.zeros_like(rows), rows, uv_left, uv_right,
+        sigmas, points_stay=True,
+    )  # fmt: skip
+    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=huber))
+    return result.world_T_kf[0], result.inlier

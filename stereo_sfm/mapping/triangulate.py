@@ -10,14 +10,16 @@ Levenberg-Marquardt with a Cauchy loss, each point with its own damping.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
+from stereo_sfm.geometry.se3_kernels import transform_point
 from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, I64
 
 TRIALS = 8  # distances tried
@@ -51,13 +53,22 @@ def _accumulate(seen, u_obs, v_obs, inv_sigma, m, derive, h, b):
     return 2.0 * math.log1p(chi2 / 4.0)
 
 
+class Seen(NamedTuple):
+    """Observations of several points, sorted by point."""
+
+    kf: I64  # (M,)
+    uv_left: F64  # (M, 2) px
+    uv_right: F64  # (M, 2) px
+    sigma: F64  # (M,) px
+
+
 @inner
-def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, limit, derive, m, h, b):
+def _cost(x, first, last, rot, pos, rows, cameras, limit, derive, m, h, b):
     """Cauchy cost of a point, and if `derive` its normal equations, lower triangle; both end at a cost of `limit`.
 
     m: (3, 3) scratch.
     """
-    left_model, left_params, right_model, right_params = cams
+    t = cameras.right_T_left
     if derive:
         h[:] = 0.0
         b[:] = 0.0
@@ -65,7 +76,7 @@ def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, righ
     for o in range(first, last):
         if cost >= limit:
             break
-        k = obs_kf[o]
+        k = rows.kf[o]
         d0, d1, d2 = x[0] - pos[k, 0], x[1] - pos[k, 1], x[2] - pos[k, 2]
         p0 = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
         p1 = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
@@ -73,21 +84,16 @@ def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, righ
         if derive:
             for i in range(3):
                 m[i, 0], m[i, 1], m[i, 2] = rot[k, 0, i], rot[k, 1, i], rot[k, 2, i]
-        s = 1.0 / sigma[o]
-        seen = project_one(left_model, left_params, p0, p1, p2)
-        cost += _accumulate(seen, uv_left[o, 0], uv_left[o, 1], s, m, derive, h, b)
-        if math.isfinite(uv_right[o, 0]):
-            q0 = right_r[0, 0] * p0 + right_r[0, 1] * p1 + right_r[0, 2] * p2 + right_t[0]
-            q1 = right_r[1, 0] * p0 + right_r[1, 1] * p1 + right_r[1, 2] * p2 + right_t[1]
-            q2 = right_r[2, 0] * p0 + right_r[2, 1] * p1 + right_r[2, 2] * p2 + right_t[2]
+        s, uv_left, uv_right = 1.0 / rows.sigma[o], rows.uv_left[o], rows.uv_right[o]
+        seen = project_one(cameras.model_l, cameras.params_l, p0, p1, p2)
+        cost += _accumulate(seen, uv_left[0], uv_left[1], s, m, derive, h, b)
+        if math.isfinite(uv_right[0]):
             if derive:
                 for i in range(3):
                     for c in range(3):
-                        m[i, c] = (
-                            right_r[i, 0] * rot[k, c, 0] + right_r[i, 1] * rot[k, c, 1] + right_r[i, 2] * rot[k, c, 2]
-                        )
-            seen = project_one(right_model, right_params, q0, q1, q2)
-            cost += _accumulate(seen, uv_right[o, 0], uv_right[o, 1], s, m, derive, h, b)
+                        m[i, c] = t[i, 0] * rot[k, c, 0] + t[i, 1] * rot[k, c, 1] + t[i, 2] * rot[k, c, 2]
+            seen = project_one(cameras.model_r, cameras.params_r, *transform_point(t, p0, p1, p2))
+            cost += _accumulate(seen, uv_right[0], uv_right[1], s, m, derive, h, b)
     return cost
 
 
@@ -99,15 +105,12 @@ def _copy(source, target):
 
 
 @njit
-def refine_points(
-    points, rays, origins, trials, starts, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, steps
-):
+def refine_points(points, rays, origins, trials, starts, rot, pos, rows, cameras, steps):
     """Improves points (P, 3) in place.
 
     Args:
         rays, origins: (P, 3) unit first ray and its origin, world. trials: (T,) metres tried along it.
-        starts: (P + 1,) first observation of each point. rot, pos: world_T_kf. obs_kf, uv_left, uv_right, sigma:
-        (M, ...) sorted by point. cams, right_r, right_t: as in bundle_kernels.linearize.
+        starts: (P + 1,) first observation of each point. rot, pos: world_T_kf. rows: Seen. cameras: StereoCameras.
     """
     h, b = np.zeros((3, 3)), np.zeros(3)
     h2, b2, m = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
@@ -120,17 +123,12 @@ def refine_points(
                 y[j] = points[i, j] if k == 0 else origins[i, j] + rays[i, j] * trials[k - 1]
             if not math.isfinite(y[0]):
                 continue
-            cost = _cost(
-                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, lowest, False, m,
-                h, b,
-            )  # fmt: skip
+            cost = _cost(y, first, last, rot, pos, rows, cameras, lowest, False, m, h, b)
             if cost < lowest:
                 lowest = cost
                 _copy(y, x)
         damping = 1e-3
-        cost = _cost(
-            x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, math.inf, True, m, h, b
-        )
+        cost = _cost(x, first, last, rot, pos, rows, cameras, math.inf, True, m, h, b)
         for _ in range(steps):
             _copy(h, damped)
             for j in range(3):
@@ -139,10 +137,7 @@ def refine_points(
                 break
             for j in range(3):
                 y[j] += x[j]
-            new = _cost(
-                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, cost, True, m, h2,
-                b2,
-            )  # fmt: skip
+            new = _cost(y, first, last, rot, pos, rows, cameras, cost, True, m, h2, b2)
             if new < cost:
                 done = cost - new < 1e-4 * cost
                 cost, damping = new, damping * 0.1
@@ -172,15 +167,12 @@ def triangulate(map_: Map, rig: Rig, rows: I64) -> F64:
     rays = np.einsum("nij,nj->ni", pose[:, :3, :3], bearing)
     base = rig.baseline if rig.stereo else 0.05
     trials = 1.0 / np.linspace(1.0 / (NEAREST * base), 1.0 / (FARTHEST * base), TRIALS)
-    right = rig.right if rig.right is not None else rig.left
-    right_T_left = se3.inverse(rig.left_T_right)
     kfs, kf_index = np.unique(table.kf[obs], return_inverse=True)
     points = map_.points.xyz[rows]
+    seen = (column[obs].astype(float) for column in (table.uv_left, table.uv_right, table.sigma))
     refine_points(
         *(points, np.ascontiguousarray(rays), np.ascontiguousarray(pose[:, :3, 3]), trials, starts),
         *(np.ascontiguousarray(keyframes.map_T_kf[kfs, :3, :3]), np.ascontiguousarray(keyframes.map_T_kf[kfs, :3, 3])),
-        *(kf_index, table.uv_left[obs].astype(float), table.uv_right[obs].astype(float)),
-        *(table.sigma[obs].astype(float), (rig.left.model_id, rig.left.params, right.model_id, right.params)),
-        *(np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy(), STEPS),
+        *(Seen(kf_index, *seen), StereoCameras.of_any(rig), STEPS),
     )
     return points

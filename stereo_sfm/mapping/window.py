@@ -20,7 +20,7 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.motion_factors import motion_factors
 from stereo_sfm.types import F64, I64, Bool
 
-FINAL_ROUNDS, FINAL_TOLERANCE = 4, 1e-5  # of the last full bundle adjustment, see `BundleConfig`
+FINAL_ROUNDS = 4  # of the last full bundle adjustment, whose weights are to converge
 MIN_SHARED_POINTS = 10  # that connect two keyframes
 
 
@@ -38,7 +38,6 @@ class Window:
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """The mapper's settings of bundle adjustment."""
     return BundleConfig(
-        rounds=config.rounds,
         iterations=config.iterations,
         huber=config.huber_sigmas,
         cauchy=config.cauchy_medians,
@@ -55,9 +54,8 @@ def final_bundle_config(config: MapperConfig) -> BundleConfig:
     right images may all disagree for a while, after a knock, and the left ones hold the map together.)
     """
     return dataclasses.replace(
-        bundle_config(config), rounds=FINAL_ROUNDS, iterations=config.final_iterations, tolerance=FINAL_TOLERANCE,
-        joint_loss=True, extend=True,
-    )  # fmt: skip
+        bundle_config(config), rounds=FINAL_ROUNDS, iterations=config.final_iterations, joint_loss=True, extend=True
+    )
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig, imu: Imu | None = None) -> Window:
@@ -108,7 +106,7 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     kf_index = np.full(len(map_.keyframes), -1, np.int64)
     kf_index[kfs] = np.arange(len(kfs))
     obs, obs_pt = np.empty(room, np.int64), np.empty(room, np.int64)
-    total = map_kernels.list_sightings(pts, points.head, table.following, table.kf, kf_index, obs, obs_pt)
+    total = map_kernels.list_sightings(pts, map_.lists, kf_index, obs, obs_pt)
     obs, obs_pt = obs[:total], obs_pt[:total]
     fixed[_floating(map_, kfs, fixed)] = True
     bundle = Bundle(
@@ -168,9 +166,9 @@ def write_back(map_: Map, part: Window, result: BundleResult) -> None:
 
 def _carry_single_points(map_: Map, kf_rows: I64, after: F64) -> None:
     """Points that only one of these keyframes observes move with it."""
-    table, points = map_.observations, map_.points
+    points = map_.points
     for row, pose in zip(kf_rows.tolist(), after, strict=True):
-        seen = table.pt[map_.observations_of_keyframe(row)].astype(np.int64)
+        seen = map_.seen_by(row)
         seen = seen[(points.obs_count[seen] == 1) & np.isfinite(points.xyz[seen, 0])]
         move = pose @ se3.inverse(map_.keyframes.map_T_kf[row])
         map_.move_points(seen, se3.transform(move, points.xyz[seen]))

@@ -13,8 +13,7 @@ from stereo_sfm.maps.update import Update
 from stereo_sfm.types import F64, I64, Bool
 
 CELL = 1.0  # metres
-SEEN = 8  # points of the session in a cell that was looked at
-KNOWN = 8  # points of earlier sessions in a cell that the map knew
+ENOUGH = 8  # points of the session in a cell that was looked at, of earlier sessions in one that the map knew
 CHANGED = 0.35  # of the usual share of points found again, below which a cell has changed
 SIGMAS = 2.0  # by which it must miss the usual number
 BESIDE_M = 3.0  # metres from an aisle's line to its shelves
@@ -40,11 +39,11 @@ def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, fl
     cell = np.floor(points[:, :2] / CELL).astype(np.int64)
     cells, which = np.unique(cell, axis=0, return_inverse=True)
     seen, known, again = (np.bincount(which[rows], minlength=len(cells)) for rows in (mine, before, mine & before))
-    looked = (seen >= SEEN) & (known >= KNOWN)
+    looked = (seen >= ENOUGH) & (known >= ENOUGH)
     usual = float(np.median(again[looked] / seen[looked])) if looked.any() else 0.0
     missing = usual * seen - again
     other = looked & (again < CHANGED * usual * seen) & (missing > SIGMAS * np.sqrt(usual * seen))
-    new = (seen >= SEEN) & (known < KNOWN)
+    new = (seen >= ENOUGH) & (known < ENOUGH)
     rows = np.flatnonzero(new | other).tolist()
     return [(NEW if new[k] else OTHER, *((cells[k] + 0.5) * CELL).tolist()) for k in rows]
 

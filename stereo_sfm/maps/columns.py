@@ -24,6 +24,7 @@ class Column:
     unknown: bool = False  # NaN means not observed
 
 
+KEYS = {"keyframes": "kf_ids", "points": "pt_ids", "observations": "obs_kf", "corners": "corner_kf"}  # of each table
 COLUMNS: dict[str, Column] = {
     "kf_ids": Column("keyframes", "int64", ascending=True),
     "frame_ids": Column("keyframes", "int64"),
@@ -58,7 +59,7 @@ def check_columns(arrays: Mapping[str, Any]) -> None:
     Raises:
         ValueError: an invalid array, named in the message.
     """
-    rows = {name: len(np.atleast_1d(arrays[first])) for name, first in _FIRST.items()}
+    rows = {name: len(np.atleast_1d(arrays[first])) for name, first in KEYS.items()}
     for name, column in COLUMNS.items():
         array = arrays[name]
         if array.dtype != column.dtype or array.shape != (rows[column.table], *column.shape):
@@ -70,9 +71,6 @@ def check_columns(arrays: Mapping[str, Any]) -> None:
     rotations = arrays["map_T_kf"][:, :3, :3]
     if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=ROTATION_TOLERANCE):
         raise ValueError("map_T_kf is not rigid")
-
-
-_FIRST = {"keyframes": "kf_ids", "points": "pt_ids", "observations": "obs_kf", "corners": "corner_kf"}
 
 
 def _check_numbers(name: str, array: Any, column: Column, above: int) -> None:

@@ -86,17 +86,18 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     from stereo_sfm.maps.extension import Extension
     from stereo_sfm.maps.kept_correction import KeptCorrection
     from stereo_sfm.maps.localizer import Localizer
+    from stereo_sfm.maps.relocalization import Relocalizer
     from stereo_sfm.maps.saved_map import load_map
 
     saved = load_map(folders.map_in, rig)
     kept = saved.correction_of(rig)
     if wanted is not None and wanted.applies and kept.any():
         wanted = KeptCorrection(rig, kept, wanted.applies)
-    vocabulary, own = configured_vocabulary(config.loop), saved.keyframe_rigs([rig])
+    vocabulary = configured_vocabulary(config.loop)
+    relocalizer = Relocalizer(saved.snapshot, rig, vocabulary, config.loop, saved.keyframe_rigs([rig]))
     if folders.localize_only:
-        return Localizer(saved.snapshot, rig, vocabulary, config.loop, own, wanted)
-    localizer = Localizer(saved.snapshot, rig, vocabulary, config.loop, own)
-    return Extension(config.mapper, rig, spans, config.loop, localizer, wanted, sensors)
+        return Localizer(relocalizer, wanted)
+    return Extension(config.mapper, rig, spans, config.loop, Localizer(relocalizer), wanted, sensors)
 
 
 def saved_map_of(mapper: AnyMapper, config: Config) -> SavedMap | None:

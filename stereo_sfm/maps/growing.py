@@ -7,7 +7,6 @@ from collections import deque
 
 import numpy as np
 
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -16,9 +15,9 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.maps.cameras import difference, unified
-from stereo_sfm.maps.merge import adjust, close_loop, full_adjustment, restore_for_merging, session_closer
+from stereo_sfm.maps.joining import Joining
 from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.maps.update import in_frame_of, with_sessions, without_superseded
+from stereo_sfm.maps.update import in_frame_of, without_superseded
 from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult
 
 _FRACTION, _ODD = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)  # of the golden ratio, a large prime
@@ -43,17 +42,14 @@ class GrowingMap:
 
     def _begin(self) -> None:
         """Without a session."""
-        s = self._base.snapshot
-        self._map = restore_for_merging(s, self._config.mapper)
-        self._rigs: dict[int, Rig] = dict(zip(s.kf_ids.tolist(), self._base.keyframe_rigs(), strict=True))
-        self._session_of = dict(zip(s.kf_ids.tolist(), self._base.sessions.tolist(), strict=True))
-        self._next_pt = int(s.pt_ids.max()) + 1
+        self._joining = Joining(self._base, self._config.loop, self._config.mapper)
+        self._map, self._rigs = self._joining.map, self._joining.rigs
+        self._next_pt = int(self._base.snapshot.pt_ids.max()) + 1
         self._keys, self._key_pt = np.zeros(0, np.uint64), np.zeros(0, np.int64)  # sightings: sorted, and their points
         self._odometry: dict[int, F64] = {}  # keyframe of the session -> its pose, continuous in a submap
         self._part: SavedMap | None = None
         self._closer: LoopCloser | None = None
         self._queue: deque[Keyframe] = deque()  # not searched yet
-        self._loops: list[LoopResult] = []
         self._bent = False  # by loops since the whole map was adjusted
 
     def take(self, part: SavedMap, place: LoopResult | None) -> None:
@@ -83,7 +79,7 @@ class GrowingMap:
             pairs = [(a, known[b]) for a, b in place.matches.tolist() if b in known]
             matches = np.array(pairs, np.int64).reshape(-1, 2)
             loop = dataclasses.replace(place, kf_id=place.kf_id + self._first_kf, matches=matches)
-            close_loop(self._map, loop, self._loops, self._config.loop, self._config.mapper)
+            self._joining.close(loop)
         self._enqueue(s, ids, new, pt_ids)
 
     def work(self) -> bool:
@@ -91,7 +87,7 @@ class GrowingMap:
         if self._part is None:
             return False
         if self._closer is None:
-            self._closer = self._new_closer(self._part)
+            self._closer = self._new_closer()
             return True
         if not self._queue:
             return self._adjust()
@@ -104,8 +100,7 @@ class GrowingMap:
     def saved(self) -> SavedMap:
         """The joined map: in the frame of the saved one, without what later sessions saw in its place."""
         assert self._part is not None
-        together, sessions = with_sessions(self._map, self._session_of)
-        rest, sessions = without_superseded(together, sessions)
+        rest, sessions = without_superseded(*self._joining.content())
         cameras = {**self._base.cameras, self._session: self._part.cameras[int(self._part.sessions.max())]}
         return SavedMap(in_frame_of(self._base.snapshot, rest), cameras, self._vocabulary.id, sessions)
 
@@ -146,7 +141,7 @@ class GrowingMap:
                 raised = dataclasses.replace(keyframe, kf_id=kf_id, submap_id=submap + self._first_submap)
                 self._map.add_keyframe(raised, se3.orthonormalize(moved_to))
                 odometry[kf_id] = se3.orthonormalize(own)
-                self._rigs[kf_id], self._session_of[kf_id] = rig, self._session
+                self._rigs[kf_id], self._joining.session_of[kf_id] = rig, self._session
             reference[submap] = reference[-1] = k
 
     def _enter_points(self, s: MapSnapshot, ids: I64, new: Bool) -> I64:
@@ -201,31 +196,24 @@ class GrowingMap:
                 chain = keyframe.submap_id + 1
                 self._queue.append(dataclasses.replace(keyframe, odom_T_cam=odometry, submap_id=chain, stamp_ns=stamp))
 
-    def _new_closer(self, part: SavedMap) -> LoopCloser:
+    def _new_closer(self) -> LoopCloser:
         """It knows the saved map, which is one rigid piece."""
-        s = self._base.snapshot
-        rigs = [self._rigs[k] for k in s.kf_ids.tolist()]
-        closer = session_closer(self._config.loop, [*rigs, part.rig], self._vocabulary)
-        for keyframe, rig in zip(s.keyframes(), rigs, strict=True):
-            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), rig)
+        closer = self._joining.closer(self._vocabulary)
+        for keyframe in self._base.snapshot.keyframes():
+            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), self._rigs[keyframe.kf_id])
         return closer
 
     def _close(self, loop: LoopResult) -> None:
-        map_, config = self._map, self._config
-        before = len(self._loops)
-        if not map_.keyframes.alive[map_.kf_row(loop.candidate_kf_id)]:
-            return
-        close_loop(map_, loop, self._loops, config.loop, config.mapper)
-        if len(self._loops) > before:
+        map_ = self._map
+        if map_.keyframes.alive[map_.kf_row(loop.candidate_kf_id)] and self._joining.close(loop):
             self._bent = True
-            around = window.covisible_window(map_, map_.kf_row(loop.kf_id), config.mapper)
-            adjust(map_, around, self._rigs, config.mapper)
+            self._joining.adjust(window.covisible_window(map_, map_.kf_row(loop.kf_id), self._config.mapper))
 
     def _adjust(self) -> bool:
         """Adjust the whole map, if loops have bent it."""
         bent, self._bent = self._bent, False
         if bent:
-            full_adjustment(self._map, self._rigs, self._config.mapper)
+            self._joining.adjust()
         return bent
 
 

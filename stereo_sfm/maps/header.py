@@ -9,9 +9,9 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-VERSION, READ = 5, (2, 3, 4, 5)
 # 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
 SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE = 3, 4, 5
+VERSION = CAMERAS_SINCE
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 
@@ -50,7 +50,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
         version = head["version"] if head["kind"] == KIND else None
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None
-    if version not in READ:
+    if version not in (2, SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE):
         raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")
     for name in COUNTS:
         if type(head.get(name)) is not int or head[name] < 0:

@@ -8,12 +8,9 @@ import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import within
-from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.level import mean_down
-from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.protocol import WithoutJobs
 from stereo_sfm.mapping.recalibration import calibration_update
 from stereo_sfm.mapping.self_calibration import SelfCalibration
@@ -33,27 +30,13 @@ class Localizer(WithoutJobs):
     map once the camera is located in it; before, and in a map without, what the newest keyframe measured.
     """
 
-    def __init__(
-        self,
-        snapshot: MapSnapshot,
-        rig: Rig,
-        vocabulary: Vocabulary,
-        config: LoopConfig,
-        own: Sequence[Rig] = (),
-        calibration: SelfCalibration | None = None,
-    ) -> None:
-        """Begin before the first keyframe.
-
-        Args:
-            snapshot: the map. rig: of the camera. own: the rigs of the map's keyframes, where they have other ones.
-            calibration: estimates corrections of the rig; None: the rig stays.
-        """
-        self.rig, self.saved = rig, snapshot
-        self._source_rig, self._calibration = rig, calibration
+    def __init__(self, relocalizer: Relocalizer, calibration: SelfCalibration | None = None) -> None:
+        """Begin before the first keyframe. Args: calibration, estimates corrections of the rig; None: the rig stays."""
+        self._relocalizer, self.saved = relocalizer, relocalizer.map
+        self.rig = self._source_rig = relocalizer.camera
+        self._calibration = calibration
         self._terms = self._tracked_terms = np.zeros(RIG_TERMS)  # of its correction: the newest, and the keyframes'
-        self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config, own)
-        self._saved_down = mean_down(snapshot.map_T_kf, snapshot.down, snapshot.down_sigma)
-        self._config = config
+        self._saved_down = mean_down(self.saved.map_T_kf, self.saved.down, self.saved.down_sigma)
         self._map_T_odom: F64 = np.eye(4)
         self._version = 0
         self._submap = -1
@@ -157,4 +140,5 @@ class Localizer(WithoutJobs):
         return not_found("not_confirmed_yet", place.inliers)
 
     def _within_gate(self, guess: F64, place: Location) -> bool:
-        return within(se3.inverse(guess) @ place.map_T_cam, self._config.gate_m, self._config.gate_deg)
+        config = self._relocalizer.config
+        return within(se3.inverse(guess) @ place.map_T_cam, config.gate_m, config.gate_deg)

@@ -17,7 +17,7 @@ from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.other_camera import widest
-from stereo_sfm.loop.place_view import PlaceView, place_view_of
+from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
     MIN_CORNERS,
     SIDE_FACTOR,
@@ -27,20 +27,17 @@ from stereo_sfm.loop.sideways import (
     sideways_config,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import Verdict, pair, verify, verify_near, within
+from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
-CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
-CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
 SIDE_PLACES = 12  # of `relocalize_candidates` that are verified beside: no confident one ends that search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
-KEPT = 64  # newest clouds: a place found ahead is a candidate beside, and cameras ask from near where they were
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,27 +88,27 @@ class Relocalizer:
         """Args:
         rig: of the camera. map_rigs: of each keyframe of the map, the same object for equal ones; none: the camera's.
         """
-        self._map, self._own, self._camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
+        self.map, self._own, self.camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
         self._rig = widest([rig, *dict.fromkeys(self._own)])  # whose pixels are compared
         self._keyframes = snapshot.keyframes()
         self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
-        self._config = dataclasses.replace(
+        self.config = dataclasses.replace(
             config,
             min_match_fraction=0.0,
             min_inliers=config.relocalize_inliers // 3,  # competing places must be known
             min_inlier_share=0.0,
-            min_cells=config.relocalize_cells,
+            min_cells=config.fewer_cells,
         )
-        side = sideways_config(config)
-        self._side_config = dataclasses.replace(side, min_inliers=config.side_inliers // 2)
+        self._side_inliers = config.side_inliers
+        self._side_config = dataclasses.replace(sideways_config(config), min_inliers=self._side_inliers // 2)
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
         self._sees = self._seen.tocsc()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
-        self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)
+        self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)  # cameras ask from near where they were
         self._vocabularies: list[Vocabulary] = []  # ahead and beside, with the idf of this map
         self._databases: list[PlaceDatabase] = []
         for corners in ([k.corners for k in self._keyframes], [k.sides for k in self._keyframes]):
@@ -128,7 +125,7 @@ class Relocalizer:
 
     def use(self, camera: Rig) -> None:
         """Use a corrected rig of the camera."""
-        self._camera = camera
+        self.camera = camera
         self._rig = widest([camera, *dict.fromkeys(self._own)])
         self._cloud.cache_clear()
 
@@ -181,7 +178,7 @@ class Relocalizer:
     def _weights(self, keyframe: Keyframe, sideways: bool) -> F64:
         """(N,) of each row of a view: of corners by how rare their words are, of points zero."""
         view, words = self._view(keyframe, sideways), self._vocabularies[sideways]
-        word, _ = words.look_up(view.descriptors)
+        word = words.look_up(view.descriptors)
         return np.where(view.corner, words.idf[word] ** 2, 0.0)
 
     def _evidence(self, keyframe: Keyframe, weights: list[F64], place: Location) -> float:
@@ -196,11 +193,11 @@ class Relocalizer:
         """The pose from all that agrees with it ahead and beside, as the nearest keyframe of the map sees it."""
         row = int(self._nearest(place.map_T_cam, 1)[0])
         together = joined([self._matches(keyframe, place.map_T_cam, row, sideways) for sideways in (False, True)])
-        if len(together) < self._config.min_inliers:
+        if together.size < self.config.min_inliers:
             return place
-        b_T_a = se3.inverse(place.map_T_cam) @ self._map.map_T_kf[row]
-        pose = refine_pose(b_T_a, together, self._rig, self._config.sigma_px)
-        map_T_cam = self._map.map_T_kf[row] @ se3.inverse(pose.b_T_a)
+        b_T_a = se3.inverse(place.map_T_cam) @ self.map.map_T_kf[row]
+        pose = refine_pose(b_T_a, together, self._rig, self.config.sigma_px)
+        map_T_cam = self.map.map_T_kf[row] @ se3.inverse(pose.b_T_a)
         if not within(se3.inverse(place.map_T_cam) @ map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG):
             return place
         return dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
@@ -212,15 +209,15 @@ class Relocalizer:
 
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
-        return ahead.confident or ahead.others < 0 or ahead.others >= self._config.side_inliers
+        return ahead.confident or ahead.others < 0 or ahead.others >= self._side_inliers
 
     def _row(self, place: Location) -> int:
         """Of the keyframe that a location was found with."""
-        return int(np.searchsorted(self._map.kf_ids, place.kf_id))
+        return int(np.searchsorted(self.map.kf_ids, place.kf_id))
 
     def _is_turned(self, place: Location) -> bool:
         """Whether the camera looks another way than the keyframe, so that only views to the side can be compared."""
-        kf_T_cam = se3.inverse(self._map.map_T_kf[self._row(place)]) @ place.map_T_cam
+        kf_T_cam = se3.inverse(self.map.map_T_kf[self._row(place)]) @ place.map_T_cam
         return bool(kf_T_cam[2, 2] < TURNED)
 
     def _with_ahead(self, keyframe: Keyframe, beside: Location) -> Location:
@@ -263,7 +260,7 @@ class Relocalizer:
         ahead = self._search_near(keyframe, guess, int(self._nearest(guess, 1)[0]), False)
         if ahead.found or len(keyframe.sides) < MIN_CORNERS:
             return ahead
-        rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self._map.map_T_kf)
+        rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self.map.map_T_kf)
         beside = self._search_near(keyframe, guess, rows[0], True) if len(rows) else ahead
         return beside if beside.found else ahead
 
@@ -275,27 +272,27 @@ class Relocalizer:
 
     def _verify_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Verdict:
         """Match a keyframe with a row's cloud around a predicted map_T_cam (4, 4)."""
-        kf_T_cam, view = se3.inverse(guess) @ self._map.map_T_kf[row], self._view(keyframe, sideways)
+        kf_T_cam, view = se3.inverse(guess) @ self.map.map_T_kf[row], self._view(keyframe, sideways)
         return verify_near(kf_T_cam, view, self._cloud(row, sideways), self._rig, self._config_of(sideways))
 
     def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
-        return place_view_of(keyframe, self._rig, self._config.disparity_sigma_px, sideways, self._camera)
+        return place_view_of(keyframe, self._rig, self.config.disparity_sigma_px, sideways, self.camera)
 
     def _config_of(self, sideways: bool) -> LoopConfig:
-        return self._side_config if sideways else self._config
+        return self._side_config if sideways else self.config
 
     def _gather(self, row: int, sideways: bool) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
         shared = self._shared(row)
         shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
-        order = np.argsort(-shared, kind="stable")[: self._config.relocalize_keyframes]
+        order = np.argsort(-shared, kind="stable")[: self.config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
         own = [self._own[k] for k in order.tolist()]
-        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways, own)
+        cloud = gather(centre, others, self._rig, self.config.disparity_sigma_px, sideways, own)
         mapped = cloud.ids >= 0
-        at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
+        at = np.searchsorted(self.map.pt_ids, cloud.ids[mapped])
         sigmas = cloud.sigmas.copy()
         sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA_M)
         return dataclasses.replace(cloud, sigmas=sigmas)
@@ -314,7 +311,7 @@ class Relocalizer:
         together[self._described] = with_neighbours(scores[self._described])
         chosen: list[int] = []
         for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
-            if len(chosen) == self._config.relocalize_candidates or scores[row] <= 0:
+            if len(chosen) == self.config.relocalize_candidates or scores[row] <= 0:
                 break
             if all(abs(row - other) > 2 for other in chosen):
                 chosen.append(row)
@@ -323,18 +320,19 @@ class Relocalizer:
     def _nearest(self, guess: F64, count: int) -> I64:
         """Rows of the nearest keyframes, nearest first."""
         rows = self._described if len(self._described) else np.arange(len(self._keyframes))
-        metres, radians = se3.extent(se3.inverse(self._map.map_T_kf[rows]) @ guess)
+        metres, radians = se3.extent(se3.inverse(self.map.map_T_kf[rows]) @ guess)
         return rows[np.argsort(metres + radians, kind="stable")[:count]]
 
     def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
-        """The location of a verification; `share`: of the camera's corners, required but from another direction."""
-        least = SIDE_FACTOR * self._config.side_inliers if sideways else self._config.relocalize_inliers
+        """The location of a verification, confident with twice what is required.
+
+        `share`: of the camera's corners, required but from another direction.
+        """
+        least = SIDE_FACTOR * self._side_inliers if sideways else self.config.relocalize_inliers
         share = 0.0 if sideways else share
-        map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
-        kf_id = int(self._map.kf_ids[row])
-        enough, confident = (
-            verdict.inliers >= times * least and verdict.share >= times * share for times in (1.0, CONFIDENCE_FACTOR)
-        )
+        map_T_cam = self.map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
+        kf_id = int(self.map.kf_ids[row])
+        enough, confident = (verdict.inliers >= times * least and verdict.share >= times * share for times in (1, 2))
         reason = "" if enough else "too_few_inliers"
         return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)
 

@@ -21,7 +21,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.cameras import MapCamera, cameras_text, difference, read_cameras, unified
-from stereo_sfm.maps.columns import check_columns
+from stereo_sfm.maps.columns import COLUMNS, KEYS, check_columns
 from stereo_sfm.maps.header import (
     CAMERAS_SINCE,
     DOWN_SINCE,
@@ -38,12 +38,7 @@ from stereo_sfm.types import F64, I64, RIG_TERMS, MapUpdate, Trajectory
 log = logging.getLogger("stereo_sfm")
 
 RIG, CAMERAS = "rig.yaml", "cameras.yaml"
-_FILES: dict[str, tuple[str, ...]] = {
-    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "down", "down_sigma", "sessions"),
-    "points": ("pt_ids", "points", "anchors", "seen", "expected"),
-    "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors"),
-    "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors", "corner_side"),
-}
+_FILES = {table: [n for n, c in COLUMNS.items() if c.table == table] for table in KEYS}
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,23 +243,23 @@ def joined(maps: list[SavedMap]) -> SavedMap:
     parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
     sessions: list[Any] = []
     cameras: dict[int, MapCamera] = {}
-    raised = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0, "anchors": 0, "obs_kf": 0, "obs_pt": 0, "corner_kf": 0}
+    ids: dict[str, int] = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0}  # the first of this map
+    rows: dict[str, int] = {"": 0, "keyframes": 0, "points": 0}
     next_session = 0
     for saved in maps:
         if saved.rig.stereo != first.rig.stereo:
             raise StereoSfmError(f"these maps cannot be merged: {difference(first.rig, saved.rig)}")
         s = saved.snapshot
         for name, values in parts.items():
-            column = getattr(s, name)
-            values.append(column + raised[name] if name in raised else column)
+            by = ids.get(name, rows[COLUMNS[name].index])
+            values.append(getattr(s, name) + by if by else getattr(s, name))
         sessions.append(saved.sessions + next_session)
         cameras |= {next_session + k: saved.cameras[k] for k in saved.session_ids}
         next_session += int(saved.sessions.max()) + 1
-        for name in ("kf_ids", "pt_ids", "submap_ids"):
-            raised[name] += int(getattr(s, name).max()) + 1
-        for name in ("anchors", "obs_kf", "corner_kf"):
-            raised[name] += len(s.kf_ids)
-        raised["obs_pt"] += len(s.pt_ids)
+        for name in ids:
+            ids[name] += int(getattr(s, name).max()) + 1
+        rows["keyframes"] += len(s.kf_ids)
+        rows["points"] += len(s.pt_ids)
     snapshot = MapSnapshot(**{name: np.concatenate(values) for name, values in parts.items()})
     return SavedMap(snapshot, cameras, first.vocabulary_id, np.concatenate(sessions))
 

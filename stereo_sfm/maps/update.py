@@ -8,32 +8,20 @@ them saw: products that were exchanged, shelves that are gone. So each view keep
 from __future__ import annotations
 
 import dataclasses
-import logging
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.map import Map, MapSnapshot
-from stereo_sfm.maps.merge import (
-    close_loop,
-    full_adjustment,
-    in_joined_ids,
-    restore_for_merging,
-    session_closer,
-    share_a_session,
-    subset,
-)
-from stereo_sfm.maps.saved_map import SavedMap, joined
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.maps.joining import join
+from stereo_sfm.maps.merge import share_a_session, subset
+from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, I64, Bool, LoopResult
-
-log = logging.getLogger("stereo_sfm")
 
 KEPT_SESSIONS = 3  # later sessions that saw a keyframe's view before it is forgotten
 VIEW_DEPTHS = 0.25  # of the median depth of a keyframe: distance of a camera with the same view
@@ -74,64 +62,26 @@ def update(
     """
     if place is None and share_a_session(saved, walk):  # with a place it was driven just now
         raise StereoSfmError("this session is in the map already")
-    both = joined([saved, walk])
-    map_ = restore_for_merging(both.snapshot, mapper)
-    first_new = len(saved)
-    loops: list[LoopResult] = []
-    fused = 0 if place is None else close_loop(map_, in_joined_ids(place, saved), loops, config, mapper)
-    rigs = both.keyframe_rigs()
-    fused += _close(map_, both, first_new, rigs, session_closer(config, rigs, vocabulary), loops, config, mapper)
-    boundary = int(both.snapshot.kf_ids[first_new])
-    if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
+    both, joining = join([saved, walk], vocabulary, config, mapper, place, rigid=True)
+    boundary = int(both.snapshot.kf_ids[len(saved)])
+    if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in joining.loops):
         raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
-    session_of = dict(zip(both.snapshot.kf_ids.tolist(), both.sessions.tolist(), strict=True))
-    together, sessions = with_sessions(map_, session_of)
+    together, sessions = joining.content()
     rest, _ = without_superseded(together, sessions)
     forgotten = len(together.kf_ids) - len(rest.kf_ids)
     if forgotten:
-        map_ = restore_for_merging(rest, mapper)
-    full_adjustment(map_, dict(zip(both.snapshot.kf_ids.tolist(), rigs, strict=True)), mapper)
-    snapshot, kept_sessions = with_sessions(map_, session_of)
+        joining.begin(rest)
+    joining.adjust()
+    snapshot, kept_sessions = joining.content()
     return Update(
         SavedMap(in_frame_of(saved.snapshot, snapshot), both.cameras, vocabulary.id, kept_sessions),
-        int(both.sessions[first_new]),
-        loops,
-        fused,
+        int(both.sessions[len(saved)]),
+        joining.loops,
+        joining.fused,
         forgotten,
         together,
         sessions,
     )
-
-
-def _close(
-    map_: Map,
-    both: SavedMap,
-    first_new: int,
-    rigs: list[Rig],
-    closer: LoopCloser,
-    loops: list[LoopResult],
-    config: LoopConfig,
-    mapper: MapperConfig,
-) -> int:
-    """Put loops of the session's keyframes (rows from `first_new` on) into map and `loops`; how many points fused."""
-    fused = 0
-    stamps = both.snapshot.stamp_ns - both.snapshot.stamp_ns[first_new]
-    chains = int(both.snapshot.submap_ids[:first_new].max()) + 1
-    for row, keyframe in enumerate(both.snapshot.keyframes()):
-        if row < first_new:  # the map is one rigid piece
-            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), rigs[row])
-            continue
-        chain = keyframe.submap_id - chains + 1
-        result = closer.step(dataclasses.replace(keyframe, submap_id=chain, stamp_ns=int(stamps[row])), rigs[row])
-        if result.candidate_kf_id >= 0:
-            fused += close_loop(map_, result, loops, config, mapper)
-    return fused
-
-
-def with_sessions(map_: Map, session_of: dict[int, int]) -> tuple[MapSnapshot, I64]:
-    """The map's content and the session of each of its keyframes."""
-    snapshot = map_.snapshot()
-    return snapshot, np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
 
 
 def without_superseded(together: MapSnapshot, sessions: I64) -> tuple[MapSnapshot, I64]:

@@ -56,7 +56,7 @@ def _tracker(
         )
     if not rig.stereo and method == "eight-point" and config.odometry.scale == "stereo":
         raise StereoSfmError(
-            "one camera has no scale: choose --set odometry.scale=unit (steps of odometry.unit_step_m) or ground-truth"
+            "one camera has no scale: choose --set odometry.scale=unit (steps of one metre) or ground-truth"
         )
     if method == "pnp" and (config.odometry.monocular or not rig.stereo):
         from stereo_sfm.tracking.features.monocular import MonocularTracker

@@ -11,9 +11,10 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.closer import GAP_WINDOW, KEPT_NEWEST, Candidate, LoopCloser
+from stereo_sfm.loop.closer import GAP_WINDOW, Candidate, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
+from stereo_sfm.mapping.culling import PASSED
 from stereo_sfm.types import F64, Corners, Keyframe, LoopResult
 from tests.loop.store_sequence import StoreSequence, make_sequence
 
@@ -196,14 +197,6 @@ def test_same_sequence_same_bits(vocabulary: voc.Vocabulary) -> None:
     assert bits() == bits()
 
 
-def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
-    sequence = make_sequence([0, 0], seed=7)
-    closer = LoopCloser(dataclasses.replace(LoopConfig(), grow_every=5), sequence.rig, vocabulary)
-    results = [closer.step(k) for k in sequence.keyframes]
-    assert len(closer.vocabulary) > len(vocabulary)
-    assert any(r.candidate_kf_id >= 0 and error_of(sequence, r) < 0.05 for r in results)
-
-
 def test_keyframes_without_corners_are_no_places(vocabulary: voc.Vocabulary) -> None:
     """Every second keyframe is not described: loops are found by the others, and only to the others."""
     sequence = make_sequence([0, 0], seed=6)
@@ -226,7 +219,7 @@ def check_forgotten(closer: LoopCloser, results: list[LoopResult]) -> None:
         assert not named & set(forgotten)
         forgotten += r.forgotten_kf_ids.tolist()
     assert len(set(forgotten)) == len(forgotten) > 0
-    newest = range(len(results) - KEPT_NEWEST, len(results))
+    newest = range(len(results) - PASSED, len(results))
     assert {*forgotten, *closer._store.ids, *newest} == set(range(len(results)))
 
 
@@ -241,7 +234,7 @@ def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found
     described = sum(keyframe.described for keyframe in sequence.keyframes[: lap + 1])
     assert keyframe_count[lap] == described  # nothing is forgotten on the first lap
     assert keyframe_count[-1] - keyframe_count[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
-    assert len(closer._database) <= 2 * closer.keyframe_count + KEPT_NEWEST + 1  # what is forgotten takes no room
+    assert len(closer._database) <= 2 * closer.keyframe_count + PASSED + 1  # what is forgotten takes no room
     check_forgotten(closer, results)
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
@@ -250,7 +243,7 @@ def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found
 def test_of_many_views_seen_every_lap_a_limited_number_is_kept_besides_the_first(
     vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stereo_sfm.loop.closer.MAX_REPEATED", 5)
+    monkeypatch.setattr("stereo_sfm.loop.closer.OF_EARLIER_VISITS", 5)
     sequence = make_sequence([0, 1] * 7, seed=3)
     closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
     results, keyframe_count = list[LoopResult](), list[int]()
@@ -259,7 +252,7 @@ def test_of_many_views_seen_every_lap_a_limited_number_is_kept_besides_the_first
         keyframe_count.append(closer.keyframe_count)
     lap = len(sequence.keyframes) // 7
     assert keyframe_count[lap] == sum(keyframe.described for keyframe in sequence.keyframes[: lap + 1])
-    assert keyframe_count[-1] < 1.2 * keyframe_count[lap] + 5 + KEPT_NEWEST  # three times as many without
+    assert keyframe_count[-1] < 1.2 * keyframe_count[lap] + 5 + PASSED  # three times as many without
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
 

@@ -120,7 +120,7 @@ def test_weak_points_are_culled_and_tracked_ones_kept(rig: Rig) -> None:
     points = mapper.map.points
     old = mapper.map.living_points()
     old = old[points.last_seen[old] < len(stream.keyframes) - 1]
-    assert (points.obs_count[old] >= CONFIG.min_observations).all()
+    assert (points.obs_count[old] >= 2).all()
     assert sum(len(u.culled_point_ids) for u in updates) > 0
     truth = stream.points[stream.truth_of_id[points.pt_id[mapper.map.living_points()]]]
     away = np.linalg.norm(points.xyz[mapper.map.living_points()] - truth, axis=1)
@@ -383,26 +383,30 @@ def test_ends_of_loops_are_thinned_out_too() -> None:
     assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02
 
 
-def test_visits_that_share_no_points_are_thinned_out_too() -> None:
+def test_visits_that_share_no_points_are_thinned_out_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """Back and forth, each time with new points: a view keeps a bounded number of keyframes of all visits."""
     once = camera_path(12, 0.1, 0.0)
     visits = 8
     poses = np.concatenate([once if k % 2 == 0 else once[::-1] for k in range(visits)])
     stream = keyframe_stream(pinhole_rig(), poses, points=600, track_length=4)
     config = dataclasses.replace(CONFIG, association="tracks", full_ba_growth=np.inf)
-    every, _ = run(stream, dataclasses.replace(config, crowd_keyframes=10_000))
     bounded, _ = run(stream, config)
+    monkeypatch.setattr("stereo_sfm.mapping.culling.OF_A_VIEW", 10_000)
+    every, _ = run(stream, config)
     assert len(every.map.living_keyframes()) > 0.7 * len(poses)
     assert len(bounded.map.living_keyframes()) < 0.5 * len(poses)
 
 
 def test_of_many_views_seen_again_a_limited_number_is_kept_besides_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stereo_sfm.mapping.mapper.PASSED", 5)
+    monkeypatch.setattr("stereo_sfm.mapping.culling.PASSED", 5)
+    monkeypatch.setattr("stereo_sfm.mapping.culling.OF_A_VIEW", 10_000)
     once = camera_path(12, 0.1, 0.0)
     poses = np.concatenate([once if k % 2 == 0 else once[::-1] for k in range(8)])
     stream = keyframe_stream(pinhole_rig(), poses, points=600, track_length=4)
-    config = dataclasses.replace(CONFIG, association="tracks", full_ba_growth=np.inf, crowd_keyframes=10_000)
-    every, few = (run(stream, dataclasses.replace(config, repeated_keyframes=n))[0] for n in (10_000, 10))
+    config = dataclasses.replace(CONFIG, association="tracks", full_ba_growth=np.inf)
+    every, _ = run(stream, config)
+    monkeypatch.setattr("stereo_sfm.mapping.culling.OF_EARLIER_VISITS", 10)
+    few, _ = run(stream, config)
     assert len(every.map.living_keyframes()) > 0.7 * len(poses)
     assert len(few.map.living_keyframes()) < 0.5 * len(poses)
     assert error(few.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02

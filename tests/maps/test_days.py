@@ -25,6 +25,7 @@ from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.extension import Extension
 from stereo_sfm.maps.folders import MapFolders, make_mapper, saved_map_of
 from stereo_sfm.maps.localizer import Localizer
+from stereo_sfm.maps.relocalization import Relocalizer
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.unfinished import save_session
 from stereo_sfm.maps.update import update
@@ -64,7 +65,8 @@ def test_a_rig_is_corrected_in_a_saved_map(
 ) -> None:
     saved = map_of_sequence(yesterday)
     rigs, calibration = saved.keyframe_rigs([WRONG]), SelfCalibration(WRONG)
-    localizer = Localizer(saved.snapshot, WRONG, vocabulary, LoopConfig(), rigs, calibration if localize_only else None)
+    relocalizer = Relocalizer(saved.snapshot, WRONG, vocabulary, LoopConfig(), rigs)
+    localizer = Localizer(relocalizer, calibration if localize_only else None)
     mapper = localizer
     if not localize_only:
         mapper = Extension(MapperConfig(), WRONG, None, LoopConfig(), localizer, calibration)

@@ -17,8 +17,9 @@ from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.folders import MapFolders, save_result
-from stereo_sfm.maps.merge import full_adjustment, merge, prune, share_a_session
-from stereo_sfm.maps.saved_map import SavedMap, joined, load_map, restore_map, save_map
+from stereo_sfm.maps.joining import Joining
+from stereo_sfm.maps.merge import merge, prune, share_a_session
+from stereo_sfm.maps.saved_map import SavedMap, joined, load_map, save_map
 from stereo_sfm.maps.store import lock
 from stereo_sfm.types import LoopResult
 from tests.loop.store_sequence import StoreSequence, make_sequence
@@ -83,10 +84,10 @@ def test_wrong_observations_leave_the_map_in_the_full_adjustment(
     wrong = np.concatenate([many[:5], two[:3]])
     uv_left = s.uv_left.copy()
     uv_left[wrong] += [12.0, -9.0]
-    map_ = restore_map(dataclasses.replace(s, uv_left=uv_left))
-    map_.points.sigma[:] = map_.observations.sigma[:] = MapperConfig().sigma_px
-    full_adjustment(map_, dict.fromkeys(s.kf_ids.tolist(), maps[1].rig), MapperConfig())
-    after = map_.snapshot()
+    wrong_map = dataclasses.replace(maps[1], snapshot=dataclasses.replace(s, uv_left=uv_left))
+    joining = Joining(wrong_map, LoopConfig(), MapperConfig())
+    joining.adjust()
+    after = joining.map.snapshot()
     seen = set(zip(after.kf_ids[after.obs_kf].tolist(), after.pt_ids[after.obs_pt].tolist(), strict=True))
     for row in wrong:
         assert (int(s.kf_ids[s.obs_kf[row]]), int(s.pt_ids[s.obs_pt[row]])) not in seen

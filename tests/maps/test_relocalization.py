@@ -195,7 +195,7 @@ def test_localizer_places_the_odometry_frame_and_keeps_it(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
     part = sequence.first(first_pass)
-    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    localizer = Localizer(Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig()))
     start = first_pass + 8
     odom = se3.inverse(sequence.keyframes[start].odom_T_cam)
     for n, k in enumerate(range(start, len(sequence.keyframes))):
@@ -211,7 +211,7 @@ def test_localizer_places_the_odometry_frame_and_keeps_it(
 
 def test_localizer_before_it_is_found(sequence: StoreSequence, vocabulary: voc.Vocabulary, first_pass: int) -> None:
     part = sequence.first(first_pass)
-    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    localizer = Localizer(Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig()))
     update = localizer.step(make_sequence([0], seed=77).keyframes[4])
     assert not localizer.found
     assert np.array_equal(update.map_T_odom, np.eye(4)) and len(update.kf_ids) == 0  # no place is claimed
@@ -227,7 +227,7 @@ def test_gravity_is_that_of_the_saved_map(sequence: StoreSequence, vocabulary: v
     keyframe = dataclasses.replace(sequence.keyframes[first_pass + 8], kf_id=0, down=felt, down_sigma=0.1)
     stranger = dataclasses.replace(make_sequence([0], seed=77).keyframes[4], down=felt, down_sigma=0.1)
     for map_, told in ((level, down), (saved, None)):  # a map without: as the keyframe says
-        localizer = Localizer(map_, sequence.rig, vocabulary, LoopConfig())
+        localizer = Localizer(Relocalizer(map_, sequence.rig, vocabulary, LoopConfig()))
         before = localizer.step(stranger)
         assert not localizer.found
         np.testing.assert_allclose(before.down, stranger.odom_T_cam[:3, 2])
@@ -247,7 +247,7 @@ def test_keyframes_before_the_first_localization_are_placed_with_it(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
     part = sequence.first(first_pass)
-    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    localizer = Localizer(Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig()))
     rows = range(first_pass + 5, first_pass + 9)
     keyframes = [dataclasses.replace(sequence.keyframes[k], kf_id=n) for n, k in enumerate(rows)]
     blind = [
@@ -272,7 +272,7 @@ def test_a_localization_with_few_points_needs_a_second_one(
     if astray:  # odometry says that the robot drove two metres between them
         second = dataclasses.replace(second, odom_T_cam=se3.exp(np.array([2.0, 0, 0, 0, 0, 0])) @ second.odom_T_cam)
     hardly_enough = dataclasses.replace(config, relocalize_inliers=round(0.8 * seen))
-    localizer = Localizer(saved, sequence.rig, vocabulary, hardly_enough)
+    localizer = Localizer(Relocalizer(saved, sequence.rig, vocabulary, hardly_enough))
     assert len(localizer.step(first).kf_ids) == 0 and not localizer.found
     assert localizer.last is not None and localizer.last.reason == "not_confirmed_yet"
     assert localizer.step(second).kf_ids.tolist() == ([] if astray else [0, 1])
@@ -283,7 +283,7 @@ def test_a_session_continues_in_the_frame_of_the_saved_map(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
     part = sequence.first(first_pass)
-    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    localizer = Localizer(Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig()))
     extension = Extension(MapperConfig(), sequence.rig, None, LoopConfig(), localizer)
     rows = range(first_pass + 5, first_pass + 15)
     odom = se3.inverse(sequence.keyframes[rows[0]].odom_T_cam)

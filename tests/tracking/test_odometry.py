@@ -160,8 +160,8 @@ def test_eight_point_without_metric_scale_gives_a_direction() -> None:
     motion = estimate("eight-point", frame_pair(MOTION, depth=False), scale="unit")
     assert not motion.metric
     assert motion.translation @ MOTION[:3, 3] / np.linalg.norm(MOTION[:3, 3]) == pytest.approx(1.0, abs=1e-6)
-    stepped = StepScale(OdometryConfig(scale="unit", unit_step_m=0.7), None).metric(motion, 0, 1)
-    assert np.linalg.norm(stepped.translation) == pytest.approx(0.7)
+    stepped = StepScale(OdometryConfig(scale="unit"), None).metric(motion, 0, 1)
+    assert np.linalg.norm(stepped.translation) == pytest.approx(1.0)
 
 
 def test_ground_truth_scale_is_the_true_step() -> None:

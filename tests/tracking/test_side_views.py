@@ -60,7 +60,7 @@ def pose(x: float, z: float, yaw_deg: float) -> F64:
 
 def matched(a: Corners, b: Corners, pose_a: F64, pose_b: F64) -> tuple[int, float]:
     """How many corners look alike, and the share of them that are one point of the fronts."""
-    rows_b, rows_a, _ = binary.match_descriptors(b.descriptors, a.descriptors, None, 60, 0.9)
+    rows_b, rows_a = binary.match_descriptors(b.descriptors, a.descriptors, None, 60, 0.9)
     at_a = se3.transform(pose_a, a.points_cam[rows_a].astype(float))
     at_b = se3.transform(pose_b, b.points_cam[rows_b].astype(float))
     return len(rows_b), float((np.linalg.norm(at_a - at_b, axis=1) < 0.3).sum()) / max(len(rows_b), 1)

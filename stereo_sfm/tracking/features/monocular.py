@@ -23,7 +23,7 @@ from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
 from stereo_sfm.tracking.features.local_points import LocalPoints
 from stereo_sfm.tracking.features.map_correction import KeyframePoses
 from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
-from stereo_sfm.tracking.features.monocular_start import MIN_MATCHES, good_points, start_from
+from stereo_sfm.tracking.features.monocular_start import MIN_MATCHES, MIN_PARALLAX_DEG, good_points, start_from
 from stereo_sfm.tracking.features.odometry.pnp import pnp_pose
 from stereo_sfm.tracking.features.outgoing import keyframe_of, observations_of
 from stereo_sfm.tracking.features.point_ids import PointIds
@@ -185,7 +185,7 @@ class MonocularTracker:
             self._keyframe.bearings[fresh[:, 0]],
             now_T_kf,
             _REPROJECT_PX * self._pixel,
-            np.radians(self._odometry.init_parallax_deg),
+            np.radians(MIN_PARALLAX_DEG),
         )
         positions = se3.transform(se3.inverse(self._odom_T_cam), self._local.positions(view.ids))
         positions[fresh[:, 1]] = points

@@ -17,6 +17,7 @@ from stereo_sfm.types import F64, Bool, Message
 
 MIN_MATCHES = 50
 MIN_POINTS = 40
+MIN_PARALLAX_DEG = 1.0  # least median of a start, and of new points: depths are then known to some percent
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,21 +37,21 @@ def start_from(b0: F64, b1: F64, pixel: float, config: OdometryConfig, rng: np.r
     """
     if len(b0) < MIN_MATCHES:
         raise Degenerate("too_few_matches", f"{len(b0)} of {MIN_MATCHES}")
-    threshold = config.init_epipolar_px * pixel
+    threshold = 2 * config.epipolar_px * pixel
     pose = relative_pose(b0, b1, threshold, rng, max_samples=config.max_samples)
     if pose.pure_rotation:
         raise Degenerate("pure_rotation", "the camera has only turned")
     share = float(pose.inliers.mean())
     if share < config.init_share:
         raise Degenerate("below_share", f"{share:.0%} of the matches fit")
-    if pose.parallax < np.radians(config.init_parallax_deg):
+    if pose.parallax < np.radians(MIN_PARALLAX_DEG):
         raise Degenerate("low_parallax", f"{np.degrees(pose.parallax):.2f} degrees")
     essential = essential_from_motion(pose.rotation, pose.direction)
     ratio = planarity(essential, b0, b1, config.epipolar_px * pixel, rng)
     if ratio > PLANAR_RATIO:
         raise Degenerate("planar_or_low_parallax", f"homography ratio {ratio:.2f}")
     first_T_second = se3.inverse(se3.from_rotation_translation(pose.rotation, pose.direction))
-    points = good_points(b0, b1, first_T_second, threshold, np.radians(0.5 * config.init_parallax_deg))
+    points = good_points(b0, b1, first_T_second, threshold, np.radians(0.5 * MIN_PARALLAX_DEG))
     points[~pose.inliers] = np.nan
     found = np.isfinite(points[:, 2])
     if found.sum() < MIN_POINTS:

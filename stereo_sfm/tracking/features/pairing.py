@@ -30,9 +30,6 @@ class Pairing:
         config = self._config
         rows = match_features(reference.features, view.features, self._norm, config.ratio)
         a, b = reference.bearings[rows[:, 0]], view.bearings[rows[:, 1]]
-        if config.motion_window_deg > 0:
-            near = (a * b).sum(1) > np.cos(np.radians(config.motion_window_deg))
-            rows, a, b = rows[near], a[near], b[near]
         if not config.motion_check:
             return rows
         return rows[epipolar_inliers(a, b, 2 * config.epipolar_px * self._pixel, rng)]

@@ -26,14 +26,13 @@ class StepScale:
         if config.scale == "ground-truth" and ground_truth is None:
             raise StereoSfmError("odometry.scale is ground-truth, but this source has no ground truth: use unit")
         self._kind = config.scale
-        self._unit = config.unit_step_m
         self._truth = ground_truth
 
     def metric(self, motion: Motion, last_stamp_ns: int, stamp_ns: int) -> Motion:
         """The motion with a length; unchanged where it has one."""
         if motion.metric:
             return motion
-        step = self._unit
+        step = 1.0
         if self._kind == "ground-truth" and self._truth is not None:
             step = float(np.linalg.norm(self._position(stamp_ns) - self._position(last_stamp_ns)))
         return replace(motion, translation=step * motion.translation, metric=True)

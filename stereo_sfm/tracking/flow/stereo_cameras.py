@@ -34,11 +34,12 @@ class StereoCameras(NamedTuple):
             raise StereoSfmError(
                 "the default tracker needs a stereo or RGB-D source (for one camera: --preset cpp-course)"
             )
-        return StereoCameras(
-            rig.left.model_id,
-            rig.left.params,
-            rig.right.model_id,
-            rig.right.params,
-            np.ascontiguousarray(rig.left_T_right),
-            np.ascontiguousarray(se3.inverse(rig.left_T_right)),
-        )
+        return StereoCameras.of_any(rig)
+
+    @staticmethod
+    def of_any(rig: Rig) -> StereoCameras:
+        """With one camera, that twice."""
+        left, right = rig.left, rig.right if rig.right is not None else rig.left
+        right_T_left = np.ascontiguousarray(se3.inverse(rig.left_T_right))
+        poses = np.ascontiguousarray(rig.left_T_right), right_T_left
+        return StereoCameras(left.model_id, left.params, right.model_id, right.params, *poses)
