@@ -41,6 +41,21 @@ class ChosenTopics:
     cameras: tuple[str, ...]
     transforms: tuple[str, ...]
 
+    @property
+    def other(self) -> str:
+        """Of the images that belong to the left ones."""
+        return self.right or self.depth
+
+    @property
+    def images(self) -> list[str]:
+        """The left topic, and the other one if there is any."""
+        return [topic for topic in (self.left, self.other) if topic]
+
+    @property
+    def samples(self) -> list[str]:
+        """Of sensors beside the cameras."""
+        return [*self.imu, *([self.wheel] if self.wheel else [])]
+
 
 def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str = "", wheel: str = "") -> ChosenTopics:
     """Find the image topics.

@@ -25,7 +25,6 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.live.buffers import Handoff, WheelBuffer
 from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import DeviceLost, NotFound
-from stereo_sfm.drivers.mcap.foreign import take_imu
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
@@ -39,6 +38,7 @@ from stereo_sfm.drivers.mcap.messages import (
     half_of,
 )
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
+from stereo_sfm.drivers.mcap.samples import take_imu
 from stereo_sfm.drivers.mcap.topics import camera_topic, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource
