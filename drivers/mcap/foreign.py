@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.folder_source import SHOWN_WARNINGS
 from stereo_sfm.drivers.image_lists import MAX_SKEW_NS
 from stereo_sfm.drivers.mcap import McapOptions
@@ -19,7 +20,7 @@ from stereo_sfm.drivers.mcap.messages import BAD_MESSAGE, ImuReading, WheelReadi
 from stereo_sfm.drivers.mcap.pairs import STEP_BACK_NS, ImagePairs, StampedImage, message_of
 from stereo_sfm.drivers.mcap.recorded_rig import RecordedRig
 from stereo_sfm.drivers.mcap.recording import Recording
-from stereo_sfm.drivers.mcap.samples import take_imu, take_wheel
+from stereo_sfm.drivers.mcap.samples import on_the_clock, take_imu, take_wheel
 from stereo_sfm.drivers.mcap.topics import choose_topics
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
@@ -54,7 +55,9 @@ class ForeignSource(BaseSource):
         first = next((message_of(record, self.name) for record in reader.messages([self.topics.left])), None)
         self._video = first.encoding if first and first.video else ""
         clock = self._found_clock()
+        self.topics = on_the_clock(reader, self.topics, clock)
         recorded = RecordedRig(reader, self.topics, first.frame if first else "")
+        self._recorded = None if options.rig else recorded
         self.rig = recorded.with_wheel(recorded.with_imu(chosen_rig(options.rig, recorded.cameras)))
         if self.topics.depth:
             self.rig = with_virtual_camera(self.rig)
@@ -92,6 +95,9 @@ class ForeignSource(BaseSource):
                 clock.skew_ns / 1e6,
             )
         return clock
+
+    def other_reading(self) -> tuple[str, Rig] | None:
+        return None if self._recorded is None else self._recorded.other_reading()
 
     def close(self) -> None:
         self.reader.close()
@@ -189,8 +195,13 @@ class ForeignSource(BaseSource):
                 why = error
         if why is None and self._video:
             why = f"'{self._video}' video without a keyframe"
-        if why is not None:
-            raise StereoSfmError(f"{self.name}: its images cannot be read: {why}")
+        if why is None:
+            left, *other = self.topics.images
+            raise StereoSfmError(
+                f"{self.name}: no image of {left} has a partner on {''.join(other)}: their stamps are never near each "
+                "other. Record both cameras at the same time, with one clock"
+            )
+        raise StereoSfmError(f"{self.name}: its images cannot be read: {why}")
 
     def _check_size(self, what: str, shape: tuple[int, ...], size: tuple[int, int]) -> None:
         if (shape[1], shape[0]) != size:

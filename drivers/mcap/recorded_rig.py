@@ -16,7 +16,7 @@ from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.drivers.mcap.clock import Clock
 from stereo_sfm.drivers.mcap.messages import BAD_MESSAGE, CAMERAS, POSES, TRANSFORMS, Transform, schema_name
 from stereo_sfm.drivers.mcap.recording import Recording
-from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
+from stereo_sfm.drivers.mcap.rig import camera_of, chain, other_reading, stereo_rig
 from stereo_sfm.drivers.mcap.samples import imu_reading, wheel_reading
 from stereo_sfm.drivers.mcap.topics import ChosenTopics, camera_topic, is_rectified
 from stereo_sfm.errors import StereoSfmError
@@ -41,7 +41,7 @@ class RecordedRig:
         Raises:
             StereoSfmError: no calibration, or one that cannot be used.
         """
-        names = tuple(camera_topic(t, self._topics.cameras) for t in (self._topics.left, self._topics.right) if t)
+        names = self._names()
         if not all(names):
             raise StereoSfmError(f"{self._name} has no calibration of its images: give one with --rig FILE")
         infos = [self._camera_info(name) for name in names]
@@ -53,6 +53,19 @@ class RecordedRig:
                 f"{self._name} has one calibration, {names[0]}, for two cameras: give one with --rig FILE"
             )
         return replace(stereo_rig(infos[0], infos[1], (names[0], names[1]), rectified, self._transforms()), name=label)
+
+    def _names(self) -> tuple[str, ...]:
+        """Topics of the calibrations, "" where there is none."""
+        return tuple(camera_topic(t, self._topics.cameras) for t in (self._topics.left, self._topics.right) if t)
+
+    def other_reading(self) -> tuple[str, Rig] | None:
+        """As of `stereo_sfm.drivers.source.Source`."""
+        names = self._names()
+        if len(names) != 2 or not all(names):
+            return None
+        left, right = map(self._camera_info, names)
+        rectified = is_rectified(self._topics.left)
+        return other_reading(left, right, (names[0], names[1]), rectified, self._transforms())
 
     def _camera_info(self, topic: str) -> CameraInfo:
         for record in self._reader.messages([topic]):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Generator, Iterable
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import permutations
 
 import numpy as np
@@ -76,6 +76,19 @@ def stereo_rig(
     if not rectified and any(camera.distortion for camera in cameras):
         stated = _with_rotation(left, right, topics, stated, known)
     return Rig(cameras[0], cameras[1], stated)
+
+
+def other_reading(
+    left: CameraInfo, right: CameraInfo, topics: tuple[str, str], rectified: bool, transforms: Iterable[Transform]
+) -> tuple[str, Rig] | None:
+    """What the messages say of images that are, against their topics' names, rectified or not; None if that is the
+    same, or cannot be. With it goes what that would mean, for a message."""
+    if rectified and not any((*left.coefficients, *right.coefficients)):
+        return None
+    text = "are not rectified, although their topics' names say so" if rectified else "are rectified already"
+    with suppress(StereoSfmError):
+        return f"the images {text}", stereo_rig(left, right, topics, not rectified, transforms)
+    return None
 
 
 def _missing(left: CameraInfo, right: CameraInfo, topics: tuple[str, str], transforms: list[Transform]) -> str:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from contextlib import suppress
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
+from stereo_sfm.drivers.checked_samples import CLOCK_S
+from stereo_sfm.drivers.mcap.clock import Clock
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     IMUS,
@@ -17,9 +21,12 @@ from stereo_sfm.drivers.mcap.messages import (
     half_of,
     schema_name,
 )
+from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.topics import ChosenTopics
 from stereo_sfm.log.reader import Record
 from stereo_sfm.types import ImuSamples, WheelSamples
+
+log = logging.getLogger("stereo_sfm")
 
 Reading = TypeVar("Reading", ImuReading, WheelReading)
 
@@ -37,6 +44,32 @@ def wheel_reading(record: Record) -> WheelReading | None:
     with suppress(*BAD_MESSAGE):
         return (VELOCITIES | JOINTS)[schema_name(record)](record.data)
     return None
+
+
+def on_the_clock(reader: Recording, topics: ChosenTopics, clock: Clock) -> ChosenTopics:
+    """The topics without sensors whose stamps have another clock than the images', with a warning."""
+    left_out = [topic for topic in topics.samples if not _has_the_clock(reader, topics, topic, clock)]
+    if not left_out:
+        return topics
+    imu = () if any(topic in left_out for topic in topics.imu) else topics.imu
+    return replace(topics, imu=imu, wheel="" if topics.wheel in left_out else topics.wheel)
+
+
+def _has_the_clock(reader: Recording, topics: ChosenTopics, topic: str, clock: Clock) -> bool:
+    for record in reader.messages([topic]):
+        reading = wheel_reading(record) if topic == topics.wheel else imu_reading(record, topics)
+        if reading is None:
+            continue
+        stamp_ns = clock.stamp(reading.stamp_ns, record.log_time)
+        away_s = abs(stamp_ns - record.log_time - clock.header_minus_log_ns) * 1e-9
+        if away_s > CLOCK_S:
+            log.warning(
+                "%s: the stamps of %s are %.3g s away from the images': another clock, its samples are not used. "
+                "Record it with the clock of the cameras",
+                reader.path, topic, away_s,
+            )  # fmt: skip
+        return away_s <= CLOCK_S
+    return True
 
 
 def take_imu(buffer: list[ImuReading], until_ns: int) -> ImuSamples:

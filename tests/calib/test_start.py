@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
+from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.start import check_start
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
@@ -101,9 +102,9 @@ def test_small_errors_and_right_calibrations_stay(pair: tuple[s.Rig, list[s.Ster
     assert check_start(wrong(rig, z_deg=0.05), images).rig is None
 
 
-@pytest.mark.parametrize("shift", [-2, 1])
-def test_images_paired_frames_apart_are_found(data_root: Path, shift: int) -> None:
-    with s.open_source(data_root / "kitti") as source:
+@pytest.mark.parametrize(("name", "shift"), [("kitti", -2), ("kitti", 1), ("store_walk", 2)])
+def test_images_paired_frames_apart_are_found(data_root: Path, name: str, shift: int) -> None:
+    with s.open_source(data_root / name) as source:
         rig, images = source.rig, list(islice(source, 17))
     apart = [replace(images[k], right=images[k - shift].right) for k in range(2, 15)]
     found = check_start(rig, apart)
@@ -138,6 +139,22 @@ def test_a_lens_under_the_name_of_another_model(
     assert found.rig is not None and found.rig.right is not None
     assert (found.rig.left.model, found.rig.right.model) == (rig.left.model, rig.right.model)
     assert check_start(found.rig, images).text == ""
+
+
+@pytest.mark.parametrize("name", ["store_walk", "euroc_mh01"])
+@pytest.mark.parametrize("rectified", [False, True])
+def test_images_that_are_rectified_or_not_against_their_name(data_root: Path, name: str, rectified: bool) -> None:
+    with s.open_source(data_root / name) as source:
+        rig, images = source.rig, list(islice(source, 13))
+    rectification = rectify(rig, "pinhole", size=rig.left.size)
+    if rectified:
+        seen = [replace(i, left=a, right=b) for i in images for a, b in [rectification.apply(i.left, i.right)]]
+        given, meant = rig, rectification.rig
+    else:
+        seen, given, meant = images, rectification.rig, rig
+    found = check_start(given, seen, lambda: ("the images are otherwise", meant))
+    assert found.rig is meant and found.shown and "topics" in found.advice
+    assert check_start(meant, seen, lambda: ("the images are otherwise", given)).text == ""
 
 
 @pytest.mark.parametrize("name", ["store_walk", "euroc_mh01"])
