@@ -65,7 +65,7 @@ def check_start(
         seen.append(image)
         if number in CHOSEN and cameras.fit(image):
             return StartFinding()
-    light = _exposure([seen[k].left for k in CHOSEN if k < len(seen)])
+    light = exposure([seen[k].left for k in CHOSEN if k < len(seen)])
     if light or not cameras.judged:
         return StartFinding(light)
     chosen = [k for k in CHOSEN if k < len(seen)]
@@ -115,7 +115,7 @@ class _Cameras:
         """Whether half of the matches are near their rows, and no other lens fits better. An image of one camera fits
         if it shows something."""
         if image.right is None or not self._stereo:
-            return not _exposure([image.left])
+            return not exposure([image.left])
         if self.rectification is None:
             self.judged = True
             return False
@@ -130,7 +130,8 @@ class _Cameras:
         return rows_fit and other_lens(self._rig, [window]) is None
 
 
-def _exposure(images: Sequence[U8]) -> str:
+def exposure(images: Sequence[U8]) -> str:
+    """Why images show nothing, "" if they do."""
     if not images:
         return ""
     middle = float(np.median([np.median(image) for image in images]))
