@@ -7,6 +7,7 @@ tangential distortion, k3 and k4 would be a lens that is tilted by several degre
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -37,12 +38,12 @@ def fisheye_in_disguise(camera: Camera) -> bool:
     return camera.model == "radtan" and len(camera.distortion) <= 4 and wide and tilt_deg(camera) > MOST_TILTED_DEG
 
 
-def believable(cameras: list[Camera], where: str) -> list[Camera]:
-    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; with a warning."""
+def believable(cameras: list[Camera], where: str, warn: Callable[..., None] = log.warning) -> list[Camera]:
+    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; `warn` is told."""
     worst = max(cameras, key=lambda camera: tilt_deg(camera) if fisheye_in_disguise(camera) else 0.0)
     if not fisheye_in_disguise(worst):
         return cameras
-    log.warning(
+    warn(
         "%s: as radial-tangential distortion these coefficients are a lens tilted by %.0f degrees: they are read as a "
         "fisheye's (Kannala-Brandt); if they are not, 'stereo-sfm convert-calib --lens plumb_bob' says so",
         where, tilt_deg(worst),

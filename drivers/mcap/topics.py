@@ -157,7 +157,10 @@ def _pair(name: str, candidates: list[str], cameras: tuple[str, ...]) -> tuple[s
     if len(candidates) == 1:
         return candidates[0], ""
     if len(candidates) == 2:
-        log.warning("%s: assuming %s is the left camera and %s the right one", name, *sorted(candidates))
+        log.warning(
+            "%s: assuming %s is the left camera and %s the right one: choose with '?left=TOPIC&right=TOPIC'",
+            name, *sorted(candidates),
+        )  # fmt: skip
         return sorted(candidates)[0], sorted(candidates)[1]
     raise StereoSfmError(
         f"{name} has {len(candidates)} image topics with ambiguous names: "

@@ -102,6 +102,13 @@ def test_a_rotation_that_only_the_transforms_have(caplog: pytest.LogCaptureFixtu
     assert "no transform tells it" in caplog.text
 
 
+def test_a_leading_slash_is_no_other_frame() -> None:
+    left, right = (replace(info, p=np.zeros((3, 4))) for info in pair())
+    apart = Transform(0, "/cam_l", "cam_r", RIG.left_T_right)
+    rig = stereo_rig(left, replace(right, frame="/cam_r"), TOPICS, False, [apart])
+    np.testing.assert_array_equal(rig.left_T_right, RIG.left_T_right)
+
+
 def test_the_other_reading_of_rectified_and_original_images() -> None:
     left, right = pair()
     for rectified in (False, True):

@@ -55,6 +55,14 @@ def test_an_inverted_transform_is_reported(images: tuple[s.Rig, list[s.StereoIma
     assert found.text.startswith("left_T_right is inverted: 0 stereo matches") and found.shown
 
 
+def test_a_transform_in_the_axes_of_a_robot_is_reported(pair: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, good = pair
+    optical_T_body = np.eye(4)
+    optical_T_body[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    found = check_start(replace(rig, left_T_right=optical_T_body.T @ rig.left_T_right @ optical_T_body), good)
+    assert "body's axes (x forwards)" in found.text and found.shown and found.rig is None
+
+
 def test_the_calibration_of_other_cameras_is_suspected(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
     rig, good = images
     bent = rig.left_T_right @ se3.exp(np.array([0, 0, 0, 0.3, 0.2, 0.1]))
