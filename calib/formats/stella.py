@@ -30,8 +30,8 @@ def read_stella(path: Path | str, size: tuple[int, int] | None = None, unit: flo
         if str(data.get("Camera.setup", "monocular")).lower() != "stereo":
             return Rig(left, name=path.stem)
         if "StereoRectifier.K_left" in data:
-            infos = (_info(data, side, left.size) for side in ("left", "right"))
-            return rig_from_infos(*infos, path.stem, unit=unit)
+            first, second = (_info(data, side, left.size) for side in ("left", "right"))
+            return rig_from_infos(first, second, path.stem, unit=unit)
         return rectified_pair(left, unit * float(data["Camera.focal_x_baseline"]) / left.fx, path.stem)
 
 

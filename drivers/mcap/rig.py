@@ -75,12 +75,12 @@ def stereo_rig(
         stated = extrinsics(left, right, rectified)
     known = list(transforms)
     measured = chain(known, left.frame, right.frame)
-    if measured is None or (stated is not None and rectified):
-        measured = stated
-        if stated is None:
-            raise StereoSfmError(_missing(left, right, topics, known))
-        if not rectified and any(camera.distortion for camera in cameras):
-            measured = _with_rotation(left, right, topics, stated, known, warn)
+    if measured is None and stated is None:
+        raise StereoSfmError(_missing(left, right, topics, known))
+    if stated is not None and (measured is None or rectified):
+        distorted = not rectified and any(camera.distortion for camera in cameras)
+        measured = _with_rotation(left, right, topics, stated, known, warn) if distorted else stated
+    assert measured is not None
     with _said_of(topics[1]):
         return Rig(cameras[0], cameras[1], measured)
 
