@@ -7,6 +7,7 @@ tangential distortion, k3 and k4 would be a lens that is tilted by several degre
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 
 import numpy as np
 
@@ -37,12 +38,12 @@ def fisheye_in_disguise(camera: Camera) -> bool:
     return camera.model == "radtan" and len(camera.distortion) <= 4 and wide and tilt_deg(camera) > MOST_TILTED_DEG
 
 
-def believable(cameras: list[Camera], where: str) -> list[Camera]:
-    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; with a warning."""
+def believable(cameras: list[Camera], where: str, warn: Callable[..., None] = log.warning) -> list[Camera]:
+    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; `warn` is told."""
     worst = max(cameras, key=lambda camera: tilt_deg(camera) if fisheye_in_disguise(camera) else 0.0)
     if not fisheye_in_disguise(worst):
         return cameras
-    log.warning(
+    warn(
         "%s: as radial-tangential distortion these coefficients are a lens tilted by %.0f degrees: they are read as a "
         "fisheye's (Kannala-Brandt); if they are not, 'stereo-sfm convert-calib --lens plumb_bob' says so",
         where, tilt_deg(worst),
@@ -51,12 +52,19 @@ def believable(cameras: list[Camera], where: str) -> list[Camera]:
 
 
 def doubts(rig: Rig) -> list[str]:
-    """Sizes that are unusual for a stereo camera of these lenses, one line each."""
+    """Sizes that are unusual for a stereo camera, one line each."""
+    return [*length_doubts(rig), *scale_doubts(rig)]
+
+
+def length_doubts(rig: Rig) -> list[str]:
+    """Lengths that are unusual for a stereo camera of these lenses, one line each."""
     if rig.second_camera is None:
         return []
     reach = rig.left.fx * rig.baseline  # metres times pixels of disparity
     millimetres = f"a baseline of {1e3 * rig.baseline:.6g} mm is unusual for"
-    remedy = "is its unit the metre? 'stereo-sfm convert-calib --unit' gives another"
+    remedy = (
+        "is its unit the metre? 'stereo-sfm convert-calib --unit' converts a file, --rig FILE gives a recording another"
+    )
     found: list[str] = []
     if reach > 0.5 * rig.left.width * NEAREST_M:
         nearest = 2 * reach / rig.left.width
@@ -65,10 +73,15 @@ def doubts(rig: Rig) -> list[str]:
         found.append(f"{millimetres} lenses that then see depth up to {reach:.2g} m: {remedy}")
     if rig.left_T_right[0, 3] < -0.5 * rig.baseline:
         found.append("the right camera is to the left of the left one: are the two exchanged, or the sign of Tx?")
-    scale = rig.second_camera.fx / rig.left.fx
-    if max(scale, 1 / scale) > MOST_SCALE:
-        found.append(
-            f"the right image shows things {scale:.2g} times as large as the left one, so that few are found in both: "
-            "'--rectify pinhole' or '--rectify wide' makes them equally large"
-        )
     return found
+
+
+def scale_doubts(rig: Rig) -> list[str]:
+    """A line about images that are not rectified and show things at very different sizes."""
+    scale = 1.0 if rig.second_camera is None else rig.second_camera.fx / rig.left.fx
+    if max(scale, 1 / scale) <= MOST_SCALE:
+        return []
+    return [
+        f"the right image shows things {scale:.2g} times as large as the left one, so that few are found in both: "
+        "'--rectify pinhole' or '--rectify wide' makes them equally large"
+    ]

@@ -22,7 +22,7 @@ from stereo_sfm.types import U8
 
 CORNERS = 200  # searched in each pair
 MAX_ROW_ERROR_PX = 2.0
-MIN_MATCHES = 25  # in a pair, with which the calibration is plausible
+MIN_MATCHES = 25  # in a pair, with which a calibration is plausible
 MIN_GAIN = 3.0  # ratio of matches with and without a mistake undone, for it to be reported
 MIN_SHARE_OF_BEST = 0.7  # of the best mistake's matches, for another one to be reported too
 
@@ -46,9 +46,18 @@ def _inverted(rig: Rig) -> Rig:
     return replace(rig, left_T_right=se3.inverse(rig.left_T_right))
 
 
+def _of_optical_axes(rig: Rig) -> Rig:
+    """A transform in axes with x forwards, y left and z up, as robots have them (REP 103), in those of cameras."""
+    body_R_optical = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    body_T_optical = se3.from_rotation_translation(body_R_optical, np.zeros(3))
+    return replace(rig, left_T_right=se3.inverse(body_T_optical) @ rig.left_T_right @ body_T_optical)
+
+
+IN_BODY_AXES = "left_T_right is in a body's axes (x forwards), not in the camera's (z forwards)"
 MISTAKES = (
     Mistake("left and right are swapped", lambda rig: rig, lambda pair: (pair[1], pair[0])),
     Mistake("left_T_right is inverted", _inverted, lambda pair: pair),
+    Mistake(IN_BODY_AXES, _of_optical_axes, lambda pair: pair),
     Mistake("both images are upside down", lambda rig: rig, lambda pair: (_turned(pair[0]), _turned(pair[1]))),
     Mistake("the left image is upside down", lambda rig: rig, lambda pair: (_turned(pair[0]), pair[1])),
     Mistake("the right image is upside down", lambda rig: rig, lambda pair: (pair[0], _turned(pair[1]))),
@@ -62,11 +71,11 @@ def mistake(rig: Rig, pairs: Sequence[Pair]) -> tuple[str, bool]:
         rig: two cameras. pairs: left and right images, one pair or more.
     """
     now = _matches(rig, pairs)
-    if now >= MIN_MATCHES:
-        return "", False
     undone = [(_matches(mistake.rig(rig), [mistake.pair(pair) for pair in pairs]), mistake) for mistake in MISTAKES]
     best = max(count for count, _ in undone)
     if best < max(MIN_MATCHES, MIN_GAIN * now):
+        if now >= MIN_MATCHES:
+            return "", False
         return f"few stereo matches ({now:.0f} per pair): is this the calibration of these cameras?", False
     names = [mistake.name for count, mistake in undone if count >= MIN_SHARE_OF_BEST * best]
     return f"{' or '.join(names)}: {now:.0f} stereo matches per pair, {best:.0f} with that undone", True

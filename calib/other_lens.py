@@ -27,6 +27,7 @@ class OtherLens:
     text: str
     rig: Rig
     known: bool  # whether their coefficients are the given ones; False: there are none, so that this is a guess
+    fits: bool = True  # the rows, as a tracker needs it; False: much better than the given ones, and yet not well
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def other_lens(rig: Rig, windows: Sequence[Window]) -> OtherLens | None:
         f"the images contradict the lens model {rig.left.model}: away from their middle, rows are off by "
         f"{given.max():.2f} px, and by {best_px:.2f} px if {best.text}"
     )
-    return replace(best, text=text)
+    return replace(best, text=text, fits=best_px < LIMIT_PX)
 
 
 def _others(rig: Rig) -> Iterator[OtherLens]:

@@ -65,7 +65,8 @@ class Rig(ReadOnly):
             baseline = self.baseline
         if self.right is not None and not BASELINE_RANGE_M[0] <= baseline <= BASELINE_RANGE_M[1]:
             raise StereoSfmError(
-                f"invalid calibration: baseline of {baseline:g} m; give the extrinsics in metres, not millimetres"
+                f"invalid calibration: baseline of {baseline:g} m; give the extrinsics in metres "
+                "('stereo-sfm convert-calib --unit mm' converts millimetres)"
             )
 
     @property

@@ -7,7 +7,7 @@ the calibration is corrected (`calib.wrong_rig`) or a mistake is named (`calib.m
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -15,7 +15,7 @@ from itertools import islice
 import numpy as np
 
 from stereo_sfm.calib.mistakes import mistake
-from stereo_sfm.calib.other_lens import other_lens
+from stereo_sfm.calib.other_lens import OtherLens, other_lens
 from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.tracks import Window, still_window
@@ -32,6 +32,7 @@ MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-cal
 FITTING_SHARE = 0.5  # of the matches
 CALIBRATE = "'stereo-sfm calibrate' measures lenses; 'stereo-sfm convert-calib --lens' says what a file's numbers are"
 ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images; then use '--rig rig.yaml'"
+READ_OTHERWISE = "name their topics so ('image_rect' or 'image_raw'), or give their calibration with '--rig FILE'"
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
 
@@ -48,12 +49,15 @@ class StartFinding:
     masked: Rig | None = None  # the given calibration with masks of what sticks to the images; None: nothing does
 
 
-def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
+def check_start(
+    rig: Rig, images: Iterable[StereoImage], other_reading: Callable[[], tuple[str, Rig] | None] = lambda: None
+) -> StartFinding:
     """Check a calibration by the first images; of one camera only the exposure is checked.
 
     Args:
         rig: the calibration.
         images: successive ones; `LOOKED_AT` of them are read, but only one if it fits.
+        other_reading: of the source, asked if they do not fit.
     """
     seen: list[StereoImage] = []
     cameras = _Cameras(rig)
@@ -61,22 +65,30 @@ def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
         seen.append(image)
         if number in CHOSEN and cameras.fit(image):
             return StartFinding()
-    light = _exposure([seen[k].left for k in CHOSEN if k < len(seen)])
+    light = exposure([seen[k].left for k in CHOSEN if k < len(seen)])
     if light or not cameras.judged:
         return StartFinding(light)
-    lens = other_lens(rig, cameras.windows)
-    if lens is not None:
-        return StartFinding(
-            lens.text if lens.known else f"{lens.text}: {CALIBRATE}", lens.rig if lens.known else None, shown=True
-        )
-    if cameras.rows_fit:
-        return StartFinding()
     chosen = [k for k in CHOSEN if k < len(seen)]
-    better = better_fit(rig, seen, chosen) if cameras.rectification is not None else None
+    other = other_reading()
+    if other is not None and _confirmed(Fit(*other, np.zeros(0)), seen, chosen):
+        return StartFinding(*other, shown=True, advice=READ_OTHERWISE)
+    lens = other_lens(rig, cameras.windows)
+    if lens is not None and lens.fits:
+        return _of_lens(lens)
+    better = None if cameras.rows_fit or cameras.rectification is None else better_fit(rig, seen, chosen)
     if better is not None and _confirmed(better, seen, chosen):
         return StartFinding(better.text, better.rig, better.shift, True)
+    if lens is not None:
+        return _of_lens(lens)
+    if cameras.rows_fit:
+        return StartFinding()
     text, shown = mistake(rig, [(seen[k].left, right) for k in chosen if (right := seen[k].right) is not None])
     return StartFinding(text, shown=shown)
+
+
+def _of_lens(lens: OtherLens) -> StartFinding:
+    text = lens.text if lens.known else f"{lens.text}: {CALIBRATE}"
+    return StartFinding(text, lens.rig if lens.known else None, shown=True)
 
 
 def _confirmed(better: Fit, images: Sequence[StereoImage], chosen: Sequence[int]) -> bool:
@@ -103,7 +115,7 @@ class _Cameras:
         """Whether half of the matches are near their rows, and no other lens fits better. An image of one camera fits
         if it shows something."""
         if image.right is None or not self._stereo:
-            return not _exposure([image.left])
+            return not exposure([image.left])
         if self.rectification is None:
             self.judged = True
             return False
@@ -118,7 +130,8 @@ class _Cameras:
         return rows_fit and other_lens(self._rig, [window]) is None
 
 
-def _exposure(images: Sequence[U8]) -> str:
+def exposure(images: Sequence[U8]) -> str:
+    """Why images show nothing, "" if they do."""
     if not images:
         return ""
     middle = float(np.median([np.median(image) for image in images]))

@@ -24,7 +24,7 @@ from stereo_sfm.calib.mask_search import (
     moments,
 )
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.start import StartFinding
+from stereo_sfm.calib.start import StartFinding, exposure
 from stereo_sfm.types import U8, Bool, StereoImage
 
 IMAGES, WITHIN = 8, 150  # looked at, among so many first ones; they are denser in the beginning
@@ -133,6 +133,8 @@ class _Camera:
         self._votes: FixedVotes | None = None
 
     def add(self, image: U8) -> None:
+        if exposure([image]):
+            return  # what sticks is all that it may show
         new = _View(image)
         self._votes = self._votes or FixedVotes(image.shape)
         for old in self._seen:

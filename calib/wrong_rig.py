@@ -130,12 +130,16 @@ def _moved_rows(rig: Rig, windows: list[Window]) -> Fit:
 
 
 def _with_rows_moved(rig: Rig, windows: list[Window]) -> Rig:
-    """The rig with the right principal point moved along y, by Newton's steps of the median row error."""
+    """The rig with the right principal point moved along y, by Newton's steps of the median row error; the same rig
+    where that moves points along their epipolar curves, as of cameras one above the other."""
     for _ in range(3):
         assert rig.right is not None
         lower = replace(rig, right=replace(rig.right, cy=rig.right.cy + 1.0))
         here, there = (np.concatenate([row_errors(one, window) for window in windows]) for one in (rig, lower))
-        rig = replace(rig, right=replace(rig.right, cy=rig.right.cy - float(np.nanmedian(here / (there - here)))))
+        across = there - here  # px of row error by a row
+        if not np.nanmedian(np.abs(across)) > 0.5:
+            return rig
+        rig = replace(rig, right=replace(rig.right, cy=rig.right.cy - float(np.nanmedian(here / across))))
     return rig
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.types import StartCheck
 
+log = logging.getLogger("stereo_sfm")
 P = ParamSpec("P")
 
 # user's name -> projection of `stereo_sfm.calib.rectification`
@@ -164,6 +166,7 @@ class SourceChoice:
             raise StereoSfmError(f"{output} is the source, or contains it: choose another -o")
 
     def __call__(self) -> Source:
+        from stereo_sfm.calib.lens_doubts import scale_doubts
         from stereo_sfm.drivers.ascending import AscendingSource
         from stereo_sfm.drivers.corrected import CorrectedSource
         from stereo_sfm.drivers.paced import PacedSource
@@ -176,6 +179,9 @@ class SourceChoice:
         source = source if self.camera_store is None else CorrectedSource(source, self.camera_store)
         if self.selection != EVERYTHING:
             source = SelectedFrames(source, **vars(self.selection))
+        if self.rectify == "none":
+            for doubt in scale_doubts(source.rig) if not source.live else ():  # a live camera's is known once entered
+                log.warning("%s: %s", source.name, doubt)
         source = rectified(source, RECTIFY[self.rectify])
         if self.start != "unchecked" or self.start_check is not None:
             source = StartCheckedSource(source, self.start == "corrected", self.start_check)

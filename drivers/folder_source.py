@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,7 +77,7 @@ def read_depth(path: Path, scale: float) -> F32:
 
 
 class FolderSource(BaseSource):
-    """Frames from files, in stamp order. A frame with an unreadable file is dropped with a warning and counted."""
+    """Frames from files. A frame with an unreadable file is dropped with a warning and counted."""
 
     def __init__(
         self,
@@ -89,7 +89,8 @@ class FolderSource(BaseSource):
         imu: ImuSamples | None = None,
     ) -> None:
         """Args:
-        name: for messages. rig: calibration of the images. frames: in any order.
+        name: for messages. rig: calibration of the images.
+        frames: in their order, which numbers in names tell where a clock was set back while they were taken.
         ground_truth: world_T_cam0.
         depth_scale: stored units of a depth image per metre.
         imu: all inertial samples, ascending: each goes with the frame that ends its interval.
@@ -99,7 +100,7 @@ class FolderSource(BaseSource):
         self.name = name
         self.rig = rig
         self.ground_truth = ground_truth
-        self.frames = sorted(frames, key=lambda frame: frame.stamp_ns)
+        self.frames = list(frames)
         self.depth_scale = depth_scale
         self.assumed_hz = 0.0  # of frames whose stamps nothing tells
         self._imu = imu
@@ -187,6 +188,11 @@ class FolderSource(BaseSource):
                 f"{path} is {width}x{height} but the calibration is for {size[0]}x{size[1]}: "
                 "use the calibration of these images (--rig FILE)"
             )
+
+
+def by_stamp(frames: Iterable[FrameFiles]) -> list[FrameFiles]:
+    """In stamp order, where nothing else tells an order."""
+    return sorted(frames, key=lambda frame: frame.stamp_ns)
 
 
 def folder_of(name: str, path: str) -> Path:

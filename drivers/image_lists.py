@@ -61,38 +61,39 @@ def numbers_of(images: list[Path]) -> list[int] | None:
 
 
 def stamps_of(files: Sequence[Path], like: Sequence[Path] = ()) -> list[int] | None:
-    """The stamps in ns in file names (left_1403636579763555584, 1305031102.175304); None if these are not times.
+    """The stamps in ns in file names (cam0_1403636579763555584, 1305031102.175304); None if these are not times.
 
-    Whole numbers count nanoseconds, microseconds, milliseconds or seconds of Unix time, or since a camera was started:
-    the unit that makes them dates, unless images would then be hours apart, else that of a usual frame rate.
+    Of several numbers in a name, the first that differs in all files and is a time counts. Whole numbers count
+    nanoseconds, microseconds, milliseconds or seconds of Unix time, or since a camera was started: the unit that makes
+    them dates, unless images would then be hours apart, else that of a usual frame rate.
 
     Args:
         like: files of the other camera, which determine the unit.
     """
-    texts = [_number_in(p.stem) for p in files]
-    others = [_number_in(p.stem) for p in like] or texts
-    if None in texts or None in others:
-        return None
-    if any("." in (text or "") for text in others):
-        stamps = [stamp_from_text(text or "") for text in texts]
+    columns = zip(_numbers_in(files), _numbers_in(like or files), strict=False)
+    return next((stamps for texts, others in columns if (stamps := _times(texts, others)) is not None), None)
+
+
+def _numbers_in(files: Sequence[Path]) -> list[list[str]]:
+    """The numbers in the files' names, by their place in them; none where names have different counts of them."""
+    rows = [re.findall(r"[0-9]+(?:\.[0-9]+)?", p.stem) for p in files]
+    return [list(column) for column in zip(*rows, strict=True)] if len({len(row) for row in rows}) == 1 else []
+
+
+def _times(texts: list[str], others: list[str]) -> list[int] | None:
+    """Nanoseconds of numbers, whose unit `others` determine; None if they are no times."""
+    if len(set(texts)) < len(texts):
+        return None  # of a camera or a part
+    if any("." in text for text in others):
+        stamps = [stamp_from_text(text) for text in texts]
         return None if any(s is None or s <= EARLIEST_NS for s in stamps) else [s or 0 for s in stamps]
-    if any((text or "").startswith("0") for text in others):
+    if any(text.startswith("0") for text in others):
         return None  # a frame number of fixed width
-    unit = _unit_of(sorted({int(text or 0) for text in others}))
-    return (
-        None
-        if unit is None or not all((text or "").isdecimal() for text in texts)
-        else [int(text or 0) * unit for text in texts]
-    )
+    unit = unit_of(sorted({int(text) for text in others}))
+    return None if unit is None or not all(map(str.isdecimal, texts)) else [int(text) * unit for text in texts]
 
 
-def _number_in(stem: str) -> str | None:
-    """The only number in a name."""
-    found = re.fullmatch(r"[^0-9]*([0-9]+(?:\.[0-9]+)?)[^0-9]*", stem)
-    return found[1] if found else None
-
-
-def _unit_of(numbers: list[int]) -> int | None:
+def unit_of(numbers: list[int]) -> int | None:
     """Nanoseconds of the unit in which ascending whole numbers count time; None for frame numbers."""
     if numbers[-1] < MIN_STAMP:
         return None
@@ -101,7 +102,7 @@ def _unit_of(numbers: list[int]) -> int | None:
     if dated is not None and step * dated < APART_NS:
         return dated
     low, high = USUAL_STEP_NS
-    return next((unit for unit in UNITS_NS if low <= step * unit < high), None)
+    return next((unit for unit in UNITS_NS if low <= step * unit < high and numbers[-1] * unit < LATEST_NS), None)
 
 
 def stamp_from_text(text: str) -> int | None:

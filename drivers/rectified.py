@@ -49,6 +49,9 @@ class RectifiedSource(WrappedSource):
             self._adopt()  # the calibration of a camera is known once it is open
         return self
 
+    def other_reading(self) -> tuple[str, Rig] | None:
+        return None  # images that were not rectified with it would not be what is asked for
+
     def stamps(self) -> Stamps | None:
         return self.source.stamps()
 

@@ -89,5 +89,6 @@ def recognise(path: Path) -> str:
     best = max(certainty, key=certainty.__getitem__, default=None)  # the first of equally confident ones
     if best is None or certainty[best] is Certainty.NO:
         known = "; ".join(f"{kind}: {found.summary}" for kind, found in drivers() if found.cameras is None)
-        raise StereoSfmError(f"{path} is not a known kind of dataset ({known})")
+        folders = f": two folders of images are 'images:{path}?left=FOLDER&right=FOLDER'" if path.is_dir() else ""
+        raise StereoSfmError(f"{path} is not a known kind of dataset{folders} (known are {known})")
     return best

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereo_sfm.calib.lens_doubts import doubts
+from stereo_sfm.calib.lens_doubts import length_doubts
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 
@@ -22,17 +22,22 @@ def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
     """The rig given by the user, as a `Rig` or a file of any supported format, else the dataset's own.
 
     A given rig without a body pose takes the dataset's, so that ground truth of the body stays usable; likewise the
-    readout, if the file format cannot store it. A warning says what is unusual about the rig's sizes.
+    readout, if the file format cannot store it. A warning says what is unusual about the rig's lengths.
     """
     rig = _chosen(option, own)
-    for doubt in doubts(rig):
+    for doubt in length_doubts(rig):
         log.warning("%s: %s", rig.name or "calibration", doubt)
     return rig
 
 
 def _chosen(option: RigOption, own: Callable[[], Rig]) -> Rig:
     if option is None or option == "":
-        return own()
+        try:
+            return own()
+        except StereoSfmError as error:
+            if "--rig" in str(error):
+                raise
+            raise StereoSfmError(f"{error}: mend it, or give a calibration with --rig FILE") from None
     given, stated = (option, True) if isinstance(option, Rig) else _load(Path(option))
     bodiless = np.array_equal(given.body_T_left, np.eye(4))
     if not bodiless and stated:

@@ -70,6 +70,11 @@ class Source(Protocol):
         """Counters of a live source (stereo_sfm.drivers.live.counters); empty for files."""
         ...
 
+    def other_reading(self) -> tuple[str, Rig] | None:
+        """Another calibration that the source may mean, and what would then be so ("the images are rectified
+        already"), for images that contradict `rig`; None where its calibration has one meaning."""
+        ...
+
     def stamps(self) -> Stamps | None:
         """The stamps of all frames if known without reading pixels, else None."""
         ...
@@ -111,6 +116,9 @@ class BaseSource(ABC):
     frame_count: int | None = None
     live: bool = False
     counters: Mapping[str, float] = _NO_COUNTERS
+
+    def other_reading(self) -> tuple[str, Rig] | None:
+        return None
 
     def stamps(self) -> Stamps | None:
         return None

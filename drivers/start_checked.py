@@ -88,7 +88,7 @@ class StartCheckedSource(WrappedSource):
 
         self._looked_at = True
         first = _FirstImages(iter(self.source))
-        finding = self._with_sticking(check_start(self.source.rig, first.looked_at()))
+        finding = self._with_sticking(check_start(self.source.rig, first.looked_at(), self.source.other_reading))
         if finding.text and first.seen:
             self._check = self._report(finding, first.seen[0])
         self._images = first.passed_on()

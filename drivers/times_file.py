@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
-from stereo_sfm.drivers.image_lists import stamp_from_text
+from stereo_sfm.drivers.image_lists import MIN_STAMP, stamp_from_text, unit_of
 from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
-
-NANOSECONDS = Decimal(10**14)  # larger numbers than that are nanoseconds, smaller ones seconds
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ def read_times(path: Path) -> Times:
     """
     lines = [line.strip() for line in read_text(path).splitlines()]
     rows = [re.split(r"[,;\s]+", line.strip(",;")) for line in lines if line and not line.startswith("#")]
-    if rows and not any(map(_number, rows[0])):
+    if rows and not any(map(_numeric, rows[0])):
         rows = rows[1:]  # a header
     if len(rows) == 1 and all(map(_number, rows[0])):
         rows = [[cell] for cell in rows[0]]
@@ -41,16 +39,22 @@ def read_times(path: Path) -> Times:
     numbers = [column for column in columns if all(map(_number, column))]
     times = [column for column in numbers if len(numbers) == 1 or not _counts(column)] or numbers[:1]
     if not times:
-        raise StereoSfmError(f"{path} must have one time in seconds or nanoseconds in each line")
+        raise StereoSfmError(f"{path} must have one time in seconds or a smaller unit in each line")
     names = next((column for column in columns if not any(map(_number, column))), [])
-    return Times([_stamp_ns(path, text) for text in times[0]], [Path(name).stem for name in names])
+    return Times(_stamps_ns(path, times[0]), [Path(name).stem for name in names])
+
+
+def _numeric(text: str) -> bool:
+    """Whether a cell is a number, NaN and infinity included."""
+    try:
+        Decimal(text)
+    except InvalidOperation:
+        return False
+    return True
 
 
 def _number(text: str) -> bool:
-    try:
-        return Decimal(text).is_finite()
-    except InvalidOperation:
-        return False
+    return _numeric(text) and Decimal(text).is_finite()
 
 
 def _counts(column: list[str]) -> bool:
@@ -59,9 +63,15 @@ def _counts(column: list[str]) -> bool:
     return first in ("0", "1") and column == [str(int(first) + k) for k in range(len(column))]
 
 
-def _stamp_ns(path: Path, text: str) -> int:
-    value = Decimal(text)
-    stamp = int(value) if value >= NANOSECONDS else stamp_from_text(text)
-    if stamp is None:
-        raise StereoSfmError(f"{path}: '{text}' is not a time in seconds or nanoseconds")
-    return stamp
+def _stamps_ns(path: Path, texts: list[str]) -> list[int]:
+    """Of seconds, or of whole numbers that count a smaller unit."""
+    values = [Decimal(text) for text in texts]
+    if max(values) < MIN_STAMP or any(value % 1 for value in values):
+        stamps = [stamp_from_text(text) for text in texts]
+    else:
+        unit = unit_of(sorted({int(value) for value in values}))
+        stamps = [None if unit is None else int(value) * unit for value in values]
+    for stamp, text in zip(stamps, texts, strict=True):
+        if stamp is None:
+            raise StereoSfmError(f"{path}: '{text}' is not a time in seconds, or since 1970 in a smaller unit")
+    return [stamp or 0 for stamp in stamps]

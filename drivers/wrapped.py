@@ -52,6 +52,9 @@ class WrappedSource:
         known = self.start_check is not None
         return self.source.given_rig if known and isinstance(self.source, WrappedSource) else self.rig
 
+    def other_reading(self) -> tuple[str, Rig] | None:
+        return self.source.other_reading()
+
     def stamps(self) -> Stamps | None:
         """The stamps of the frames passed on: unknown in advance, unless a subclass knows them."""
         return None

@@ -36,12 +36,12 @@ _SPHERES: dict[str, tuple[type[Camera], tuple[str, ...]]] = {  # the ucm has no 
 _RADTAN8 = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
-def read_basalt(path: Path | str, pair: tuple[int, int] = (0, 1)) -> Rig:
-    """The two cameras of `pair`, or the only one."""
+def read_basalt(path: Path | str, pair: tuple[int, int] = (0, 1), unit: float = 1.0) -> Rig:
+    """The two cameras of `pair`, or the only one; `unit`: of lengths, in metres."""
     path = Path(path)
     with reading(path, "Basalt"):
         data = read_json(path)["value0"]
-        poses = [_pose(p) for p in data["T_imu_cam"]]
+        poses = [_pose(p, unit) for p in data["T_imu_cam"]]
         cameras = [_camera(c, r) for c, r in zip(data["intrinsics"], data["resolution"], strict=True)]
         a, b = pair if len(cameras) > 1 else (0, 0)
         imu = _imu(data, se3.inverse(poses[a])) if "imu_update_rate" in data else None
@@ -99,9 +99,9 @@ def _with_triangular_matrix(imu: Imu) -> Imu:
     return replace(turned, accel_matrix=np.tril(turned.accel_matrix))
 
 
-def _pose(data: dict[str, float]) -> F64:
+def _pose(data: dict[str, float], unit: float) -> F64:
     quaternion = np.array([data[k] for k in ("qx", "qy", "qz", "qw")], float)
-    translation = np.array([data[k] for k in ("px", "py", "pz")], float)
+    translation = unit * np.array([data[k] for k in ("px", "py", "pz")], float)
     return se3.from_rotation_translation(se3.rotation_from_quaternion(quaternion), translation)
 
 

@@ -73,7 +73,8 @@ class CameraInfo:
             return KannalaBrandt(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(d[:4]))
         if model in _BROWN:
             return brown(size, (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), info.coefficients)
-        raise ValueError(f"distortion model '{info.distortion_model}' is not supported")
+        known = ", ".join(name for name in (*_BROWN, *_FISHEYE) if name)
+        raise ValueError(f"distortion model '{info.distortion_model}' is not supported (supported: {known})")
 
     def offset(self) -> F64:
         """(3,) metres: the rectified camera's points are those of the pair's reference plus this."""

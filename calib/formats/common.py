@@ -25,8 +25,10 @@ def reading(path: Path | str, file_format: str) -> Generator[None]:
     """Convert any error while a calibration is read into one line that names the file and the reason."""
     try:
         yield
-    except StereoSfmError:
-        raise
+    except StereoSfmError as error:
+        if str(path) in str(error) or file_format in str(error):
+            raise
+        raise StereoSfmError(f"{file_format} calibration {path}: {error}") from None
     except FileNotFoundError as error:
         raise StereoSfmError(f"no {file_format} calibration: {error.filename or path} does not exist") from None
     except KeyError as error:
@@ -110,8 +112,11 @@ def numbers(values: Any, count: int | None = None) -> list[float]:
     return [float(v) for v in flat]
 
 
-def rigid(values: Any) -> F64:
-    """16 (or 12) numbers row by row -> (4, 4) with the rotation orthonormalized if it was rounded in the file."""
+def rigid(values: Any, unit: float = 1.0) -> F64:
+    """16 (or 12) numbers row by row -> (4, 4) with the rotation orthonormalized if it was rounded in the file.
+
+    `unit`: of the translation, in metres.
+    """
     ragged = isinstance(values, list) and len({len(row) if isinstance(row, list) else 0 for row in values}) > 1
     flat = np.zeros(0) if ragged else np.array(numbers(values))
     if len(flat) not in (12, 16):
@@ -119,6 +124,7 @@ def rigid(values: Any) -> F64:
         raise ValueError(f"a transform needs 4 rows of 4 numbers (or 12 or 16 in one row), found {found}")
     transform = np.eye(4)
     transform[:3] = flat[:12].reshape(3, 4)
+    transform[:3, 3] *= unit
     return exact_rotation(transform)
 
 

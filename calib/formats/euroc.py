@@ -14,16 +14,19 @@ from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.types import F64
 
 
-def read_euroc(folder: Path | str) -> Rig:
-    """The dataset's root, its `mav0`, or any folder that holds `cam0/sensor.yaml`; one camera when there is no cam1."""
+def read_euroc(folder: Path | str, unit: float = 1.0) -> Rig:
+    """The dataset's root, its `mav0`, or any folder that holds `cam0/sensor.yaml`; one camera when there is no cam1.
+
+    `unit`: of lengths, in metres.
+    """
     folder = Path(folder)
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    left, body_T_left = _sensor(root / "cam0" / "sensor.yaml")
+    left, body_T_left = _sensor(root / "cam0" / "sensor.yaml", unit)
     left_T_body, file = se3.inverse(body_T_left), root / "imu0" / "sensor.yaml"
     imu = read_imu(file, left_T_body) if file.is_file() else None
     if not (root / "cam1" / "sensor.yaml").is_file():
         return Rig(left, body_T_left=body_T_left, imu=imu, name=folder.name)
-    right, body_T_right = _sensor(root / "cam1" / "sensor.yaml")
+    right, body_T_right = _sensor(root / "cam1" / "sensor.yaml", unit)
     return Rig(left, right, left_T_body @ body_T_right, body_T_left, imu=imu, name=folder.name)
 
 
@@ -41,14 +44,14 @@ def write_euroc(rig: Rig, folder: Path) -> None:
         write_euroc_imu(rig.imu, rig.body_T_left @ rig.imu.left_T_imu, folder / "imu0" / "sensor.yaml")
 
 
-def _sensor(path: Path) -> tuple[Camera, F64]:
+def _sensor(path: Path, unit: float) -> tuple[Camera, F64]:
     with reading(path, "EuRoC"):
         data = read_yaml(path)
         size = [int(v) for v in numbers(data["resolution"], 2)]
         fx, fy, cx, cy = numbers(data["intrinsics"], 4)
         model = data["distortion_model"]
         coefficients = numbers(data.get("distortion_coefficients", []))
-        body_T_cam = rigid(data["T_BS"]["data"])
+        body_T_cam = rigid(data["T_BS"]["data"], unit)
         if model == "equidistant":
             camera = KannalaBrandt(size[0], size[1], fx, fy, cx, cy, tuple(numbers(coefficients, 4)))
         elif model in ("radial-tangential", "radtan", "none"):

@@ -35,21 +35,23 @@ _MODELS: dict[str, tuple[type[Camera], int]] = {
 }
 
 
-def read_kalibr(path: Path | str, pair: tuple[int, int] = (0, 1), imu_file: Path | None = None) -> Rig:
+def read_kalibr(
+    path: Path | str, pair: tuple[int, int] = (0, 1), imu_file: Path | None = None, unit: float = 1.0
+) -> Rig:
     """The two cameras of `pair`; the body is the IMU when its pose is known.
 
     OpenVINS's file, whose T_imu_cam are the inverse of Kalibr's T_cam_imu, is read, too.
 
     Args:
         path: the camchain. pair: numbers of the left and the right camera.
-        imu_file: Kalibr's imu.yaml; None: one of `IMU_FILES` beside the camchain.
+        imu_file: Kalibr's imu.yaml; None: one of `IMU_FILES` beside the camchain. unit: of lengths, in metres.
     """
     path = Path(path)
     with reading(path, "Kalibr"):
         data = read_yaml(path)
         first, second = data[f"cam{pair[0]}"], data.get(f"cam{pair[1]}")
         left = _camera(first)
-        left_T_imu = _cam_T_imu(first)
+        left_T_imu = _cam_T_imu(first, unit)
         body_T_left = np.eye(4) if left_T_imu is None else se3.inverse(left_T_imu)
         files = [path.with_name(name) for name in IMU_FILES] if imu_file is None else [imu_file]
         file, imu = next((f for f in files if f.is_file()), None), None
@@ -59,26 +61,26 @@ def read_kalibr(path: Path | str, pair: tuple[int, int] = (0, 1), imu_file: Path
             if pair != (0, 1):
                 raise KeyError(f"cam{pair[1]}")
             return Rig(left, body_T_left=body_T_left, imu=imu, name=path.stem)
-        return Rig(left, _camera(second), _left_T_right(data, pair), body_T_left, imu=imu, name=path.stem)
+        return Rig(left, _camera(second), _left_T_right(data, pair, unit), body_T_left, imu=imu, name=path.stem)
 
 
-def _cam_T_imu(camera: dict[str, Any]) -> F64 | None:
+def _cam_T_imu(camera: dict[str, Any], unit: float) -> F64 | None:
     """(4, 4), None where it is not known."""
     if "T_imu_cam" in camera:
-        return se3.inverse(rigid(camera["T_imu_cam"]))
-    return rigid(camera["T_cam_imu"]) if "T_cam_imu" in camera else None
+        return se3.inverse(rigid(camera["T_imu_cam"], unit))
+    return rigid(camera["T_cam_imu"], unit) if "T_cam_imu" in camera else None
 
 
-def _left_T_right(data: dict[str, Any], pair: tuple[int, int]) -> F64:
+def _left_T_right(data: dict[str, Any], pair: tuple[int, int], unit: float) -> F64:
     """(4, 4) by the product of T_cn_cnm1 between the two cameras, else by the poses of both to the IMU."""
     first, last = sorted(pair)
     between = [data.get(f"cam{k}", {}) for k in range(first + 1, last + 1)]
     if all("T_cn_cnm1" in camera for camera in between):
         last_T_first = np.eye(4)
         for camera in between:
-            last_T_first = rigid(camera["T_cn_cnm1"]) @ last_T_first
+            last_T_first = rigid(camera["T_cn_cnm1"], unit) @ last_T_first
         return se3.inverse(last_T_first) if first == pair[0] else last_T_first
-    left_T_imu, right_T_imu = (_cam_T_imu(data[f"cam{k}"]) for k in pair)
+    left_T_imu, right_T_imu = (_cam_T_imu(data[f"cam{k}"], unit) for k in pair)
     if left_T_imu is None or right_T_imu is None:
         raise KeyError("T_cn_cnm1")
     return left_T_imu @ se3.inverse(right_T_imu)

@@ -14,7 +14,7 @@ import numpy as np
 
 from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows, rig_from_infos
 from stereo_sfm.calib.formats.common import numbers, reading, rigid
-from stereo_sfm.calib.formats.settings_files import image_size, lens, read_flat, rectified_pair
+from stereo_sfm.calib.formats.settings_files import Lenses, read_flat, rectified_pair
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
@@ -26,46 +26,44 @@ _NOISE = {  # ours -> densities, as in its Settings.cc
     "accel_walk": "IMU.AccWalk",
     "rate_hz": "IMU.Frequency",
 }
-_MODELS = {"pinhole": False, "rectified": False, "kannalabrandt8": True}  # -> whether it is a fisheye
+_LENSES = Lenses(
+    "Camera.type", {"pinhole": False, "rectified": False, "kannalabrandt8": True}, ("Camera.width", "Camera.height")
+)
 _DEPTH = ("DepthMapFactor", "RGBD.DepthMapFactor")  # of files for a camera with depth, whose baseline is virtual
 
 
-def read_orbslam(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
+def read_orbslam(path: Path | str, size: tuple[int, int] | None = None, unit: float = 1.0) -> Rig:
     """One camera or a stereo pair.
 
     Args:
-        path: the file. size: (width, height) px where it states none.
+        path: the file. size: (width, height) px where it states none. unit: of lengths, in metres.
     """
     path = Path(path)
     with reading(path, "ORB-SLAM"):
         data = read_flat(path)
-        rig = _cameras(data, path.stem, size)
+        rig = _cameras(data, path.stem, size, unit)
         pose = data.get("IMU.T_b_c1", data.get("Tbc"))
         if pose is None:
             return rig
-        body_T_left = rigid(pose)
+        body_T_left = rigid(pose, unit)
         noise: dict[str, Any] = {ours: float(data[theirs]) for ours, theirs in _NOISE.items() if theirs in data}
         return replace(rig, body_T_left=body_T_left, imu=Imu(se3.inverse(body_T_left), **noise))
 
 
-def _cameras(data: dict[str, Any], name: str, size: tuple[int, int] | None) -> Rig:
+def _cameras(data: dict[str, Any], name: str, size: tuple[int, int] | None, unit: float) -> Rig:
     if "LEFT.K" in data:  # ORB-SLAM2: original images, rectified by the program
-        return rig_from_infos(_info(data, "LEFT."), _info(data, "RIGHT."), name)
-    kind = str(data.get("Camera.type", "PinHole"))
-    if kind.lower() not in _MODELS:
-        raise ValueError(f"camera type '{kind}' is not supported (supported: {', '.join(_MODELS)})")
-    fisheye, size = _MODELS[kind.lower()], image_size(data, ("Camera.width", "Camera.height"), size)
-    left = lens(data, "Camera1." if "Camera1.fx" in data else "Camera.", fisheye, size)
-    if any(name in data for name in _DEPTH):
+        return rig_from_infos(_info(data, "LEFT."), _info(data, "RIGHT."), name, unit=unit)
+    left = _LENSES.of(data, size, "Camera1.", "Camera.")
+    if any(key in data for key in _DEPTH):
         return Rig(left, name=name)
     pose = data.get("Stereo.T_c1_c2", data.get("Tlr"))
     if pose is not None and "Camera2.fx" in data:
-        return Rig(left, lens(data, "Camera2.", fisheye, size), rigid(pose), name=name)
+        return Rig(left, _LENSES.of(data, size, "Camera2."), rigid(pose, unit), name=name)
     if "Stereo.b" in data:
-        return rectified_pair(left, float(data["Stereo.b"]), name)
-    return (
-        rectified_pair(left, float(data["Camera.bf"]) / left.fx, name) if "Camera.bf" in data else Rig(left, name=name)
-    )
+        return rectified_pair(left, unit * float(data["Stereo.b"]), name)
+    if "Camera.bf" in data:
+        return rectified_pair(left, unit * float(data["Camera.bf"]) / left.fx, name)
+    return Rig(left, name=name)
 
 
 def _info(data: dict[str, Any], prefix: str) -> CameraInfo:

@@ -1,7 +1,9 @@
-"""What the settings files of SLAM systems share: flat keys, sizes, lenses, a right camera by its baseline."""
+"""What the settings files of SLAM systems share: flat keys, lenses with their sizes, a right camera by its baseline."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +36,34 @@ def _flat(prefix: str, data: dict[str, Any]) -> list[tuple[str, Any]]:
     return found
 
 
-def lens(data: dict[str, Any], prefix: str, fisheye: bool, size: tuple[int, int]) -> Camera:
+@dataclass(frozen=True)
+class Lenses:
+    """How a program states lenses.
+
+    Attributes:
+        kind: key of the lens model.
+        fisheye: values of that key, in lower case -> whether it is a fisheye; the first where the key is missing.
+        size: keys of width and height.
+    """
+
+    kind: str
+    fisheye: Mapping[str, bool]
+    size: tuple[str, str]
+
+    def of(self, data: dict[str, Any], asked: tuple[int, int] | None, *prefixes: str) -> Camera:
+        """The camera of the first prefix that the file has, for images of the size asked for or stated.
+
+        Raises:
+            ValueError: another lens model, or no size.
+        """
+        kind = str(data.get(self.kind, next(iter(self.fisheye)))).lower()
+        if kind not in self.fisheye:
+            raise ValueError(f"{self.kind} '{kind}' is not supported (supported: {', '.join(self.fisheye)})")
+        prefix = next((p for p in prefixes if f"{p}fx" in data), prefixes[-1])
+        return _lens(data, prefix, self.fisheye[kind], image_size(data, self.size, asked))
+
+
+def _lens(data: dict[str, Any], prefix: str, fisheye: bool, size: tuple[int, int]) -> Camera:
     """The camera of `prefix`fx, fy, cx, cy and k1 ..., with OpenCV's coefficients or those of a fisheye."""
     fx, fy, cx, cy = numbers([data[f"{prefix}{name}"] for name in ("fx", "fy", "cx", "cy")])
     names = KannalaBrandt.coefficients if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")

@@ -11,31 +11,28 @@ from typing import Any
 
 from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows, rig_from_infos
 from stereo_sfm.calib.formats.common import numbers, reading
-from stereo_sfm.calib.formats.settings_files import image_size, lens, read_flat, rectified_pair
+from stereo_sfm.calib.formats.settings_files import Lenses, read_flat, rectified_pair
 from stereo_sfm.calib.rig import Rig
 
-_MODELS = ("perspective", "fisheye")
+_LENSES = Lenses("Camera.model", {"perspective": False, "fisheye": True}, ("Camera.cols", "Camera.rows"))
 
 
-def read_stella(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
+def read_stella(path: Path | str, size: tuple[int, int] | None = None, unit: float = 1.0) -> Rig:
     """One camera or a stereo pair.
 
     Args:
-        path: the file. size: (width, height) px where it states none.
+        path: the file. size: (width, height) px where it states none. unit: of lengths, in metres.
     """
     path = Path(path)
     with reading(path, "stella_vslam"):
         data = read_flat(path)
-        model = str(data["Camera.model"]).lower()
-        if model not in _MODELS:
-            raise ValueError(f"camera model '{model}' is not supported (supported: {', '.join(_MODELS)})")
-        size = image_size(data, ("Camera.cols", "Camera.rows"), size)
+        left = _LENSES.of(data, size, "Camera.")  # of the rectified images, if any
         if str(data.get("Camera.setup", "monocular")).lower() != "stereo":
-            return Rig(lens(data, "Camera.", model == "fisheye", size), name=path.stem)
+            return Rig(left, name=path.stem)
         if "StereoRectifier.K_left" in data:
-            return rig_from_infos(_info(data, "left", size), _info(data, "right", size), path.stem)
-        left = lens(data, "Camera.", model == "fisheye", size)
-        return rectified_pair(left, float(data["Camera.focal_x_baseline"]) / left.fx, path.stem)
+            first, second = (_info(data, side, left.size) for side in ("left", "right"))
+            return rig_from_infos(first, second, path.stem, unit=unit)
+        return rectified_pair(left, unit * float(data["Camera.focal_x_baseline"]) / left.fx, path.stem)
 
 
 def _info(data: dict[str, Any], side: str, size: tuple[int, int]) -> CameraInfo:

@@ -28,8 +28,8 @@ _FOCAL = {
 }
 
 
-def read_vins(path: Path | str) -> Rig:
-    """The cameras that a settings file names, or one camera file alone."""
+def read_vins(path: Path | str, unit: float = 1.0) -> Rig:
+    """The cameras that a settings file names, or one camera file alone; `unit`: of lengths, in metres."""
     path = Path(path)
     with reading(path, "VINS"):
         data = read_flat(path)
@@ -37,7 +37,7 @@ def read_vins(path: Path | str) -> Rig:
         if "num_of_cam" in data:
             files = files[: int(data["num_of_cam"])]
         cameras = [_camera(read_flat(file)) for file in files] or [_camera(data)]
-        poses = [_pose(data, k) for k in range(len(cameras))]
+        poses = [_pose(data, k, unit) for k in range(len(cameras))]
         body_T_left = np.eye(4) if poses[0] is None else poses[0]
         imu = None
         if poses[0] is not None and int(data.get("imu", 1)):
@@ -49,14 +49,14 @@ def read_vins(path: Path | str) -> Rig:
         return Rig(cameras[0], cameras[1], se3.inverse(poses[0]) @ poses[1], body_T_left, imu=imu, name=path.stem)
 
 
-def _pose(data: dict[str, Any], camera: int) -> F64 | None:
+def _pose(data: dict[str, Any], camera: int, unit: float) -> F64 | None:
     """body_T_camera (4, 4); VINS-Mono states its rotation and translation apart."""
     if f"body_T_cam{camera}" in data:
-        return rigid(data[f"body_T_cam{camera}"])
+        return rigid(data[f"body_T_cam{camera}"], unit)
     if camera or "extrinsicRotation" not in data:
         return None
     rotation = np.reshape(numbers(data["extrinsicRotation"], 9), (3, 3))
-    return rigid(np.column_stack([rotation, numbers(data["extrinsicTranslation"], 3)]).ravel().tolist())
+    return rigid(np.column_stack([rotation, numbers(data["extrinsicTranslation"], 3)]).ravel().tolist(), unit)
 
 
 def _camera(data: dict[str, Any]) -> Camera:

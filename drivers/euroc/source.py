@@ -15,7 +15,7 @@ from pathlib import Path
 from stereo_sfm.calib.formats.euroc import read_euroc as read_rig
 from stereo_sfm.calib.formats.kalibr import read_kalibr
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, by_stamp, folder_of, need
 from stereo_sfm.drivers.ground_truth import moved, read_euroc
 from stereo_sfm.drivers.image_lists import Listing, pair_listings
 from stereo_sfm.drivers.imu_table import read_imu_samples
@@ -62,7 +62,7 @@ def _open(name: str, mav: Path, rig: Rig) -> FolderSource:
         right = _read_listing(need(mav / "cam1", "second camera"))
         pairs = pair_listings(name, left, right)
         frames = [replace(frames[i], right=right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
-    return FolderSource(name, rig, frames, _ground_truth(mav, rig), imu=_inertial(mav))
+    return FolderSource(name, rig, by_stamp(frames), _ground_truth(mav, rig), imu=_inertial(mav))
 
 
 def _read_listing(camera: Path) -> Listing:

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 ASSUMED_FPS = 30.0
 # Words beside which numbers tell cameras apart (`calib.side_names`), and not recordings.
-CAMERAS = {"cam", "camera", "image", "img", "infra", "ir", "fisheye", "view", "rect"}
-TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
+CAMERAS = {"cam", "camera", "image", "img", "im", "infra", "ir", "fisheye", "view", "rect", "sensor", "lens", "eye"}
+TIMES = tuple(f"{name}{suffix}" for name in ("times", "timestamps", "timestamp") for suffix in (".txt", ".csv"))
 RIG_NAMES = ("rig", "calibration", "calib", "camchain", "stereo", "intrinsics")
 RIG_SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 TRUTH_NAMES = ("groundtruth.txt", "groundtruth.tum", "poses.tum", "poses.txt")

@@ -13,7 +13,7 @@ import numpy as np
 from stereo_sfm.calib.camera_rotation import align_cameras
 from stereo_sfm.calib.formats.kapture import read_kapture, read_kapture_cameras
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, by_stamp, folder_of, need
 from stereo_sfm.drivers.image_lists import Listing, list_images, pair_listings
 from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
@@ -38,7 +38,7 @@ def open_kapture(path: str, options: SourceOptions) -> FolderSource:
     name = f"kapture:{folder.resolve().name}"
     left, right = _listings(folder)
     pairs = pair_listings(name, left, right)
-    frames = [FrameFiles(left[i][0], left[i][1], right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
+    frames = by_stamp(FrameFiles(left[i][0], left[i][1], right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs)
     guessed = not options.rig and not _sensors(folder).with_name("rigs.txt").is_file()
     source = FolderSource(name, chosen_rig(options.rig, lambda: _read_rig(folder)), frames)
     if guessed:

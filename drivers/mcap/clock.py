@@ -1,7 +1,7 @@
 """The clock of a recording of another program: one for all its topics, and what its images' stamps say.
 
-The stamps in the messages' headers count where every image topic has them; else the times at which messages were
-logged do, for all topics. A sensor without header stamps gets its log times on the clock of the headers.
+The stamps in the messages' headers count where every image topic has them, of one clock; else the times at which
+messages were logged do, for all topics. A sensor without header stamps gets its log times on the clock of the headers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Clock:
     by_header: bool
     header_minus_log_ns: int  # median of the images
     period_ns: int  # between the left camera's images
-    skew_ns: int  # median difference from a left image to the nearest of the other camera, 0 without one
+    skew_ns: int  # median difference from a left image to the nearest of the other camera, 0 where none is near
 
     def stamp(self, header_ns: int, log_ns: int) -> int:
         """Of a message on this clock."""
@@ -59,13 +59,34 @@ def clock_of(name: str, topics: list[str], stamps: Callable[[str], Iterable[tupl
             f"{name}: nothing tells when its images were taken: the header stamps of {', '.join(silent)} are all the "
             "same, and so are the log times: extract the images and run them with 'images:FOLDER?fps=N'"
         )
-    columns = logs if silent else headers
-    steps = np.diff(columns[0])
-    period_ns = int(np.median(steps[steps > 0])) if (steps > 0).any() else USUAL_NS
-    skew_ns = int(np.median(_distances(columns[0], columns[1]))) if len(columns) > 1 and len(columns[1]) else 0
-    offset_ns = 0 if silent else int(np.median(headers[0] - logs[0])) if len(logs[0]) else 0
     warning = f"the header stamps of {', '.join(silent)} are all the same: the times of logging count" if silent else ""
-    return Clock(not silent, offset_ns, period_ns, skew_ns), warning
+    if not silent and len(topics) > 1 and _skew_ns(*headers) is None and _skew_ns(*logs) is not None:
+        apart_s = abs(float(np.median(headers[1])) - float(np.median(headers[0]))) * 1e-9
+        silent = topics
+        warning = (
+            f"the header stamps of {topics[0]} and {topics[1]} are of two clocks, {apart_s:.3g} s apart: the times of "
+            "logging count"
+        )
+    columns = logs if silent else headers
+    skew_ns = _skew_ns(*columns) if len(columns) > 1 else None
+    offset_ns = 0 if silent else int(np.median(headers[0] - logs[0])) if len(logs[0]) else 0
+    return Clock(not silent, offset_ns, _period_ns(columns[0]), skew_ns or 0), warning
+
+
+def _period_ns(stamps: I64) -> int:
+    """Between images."""
+    steps = np.diff(stamps)
+    return int(np.median(steps[steps > 0])) if (steps > 0).any() else USUAL_NS
+
+
+def _skew_ns(left: I64, right: I64) -> int | None:
+    """Median difference from the left stamps to the nearest right ones, where both cameras have some; None if at no
+    time both have."""
+    if not len(left) or not len(right):
+        return None
+    period_ns = _period_ns(left)
+    both = left[(left > right.min() - period_ns) & (left < right.max() + period_ns)]
+    return int(np.median(_distances(both, right))) if len(both) else None
 
 
 def _runs(stamps: I64) -> bool:

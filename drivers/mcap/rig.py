@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Generator, Iterable
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable
+from contextlib import contextmanager, suppress
 from itertools import permutations
 
 import numpy as np
@@ -23,6 +23,7 @@ log = logging.getLogger("stereo_sfm")
 
 _OTHERWISE = "give a calibration with --rig FILE"
 _SAME_LENGTH = 0.02  # share by which P's baseline and that of the transforms may differ, both being rounded
+Warn = Callable[..., None]  # as `Logger.warning`
 _PARALLEL_DEG = 45.0  # cameras of a pair see the same; axes of a camera's body are turned by 90 from its optical ones
 
 
@@ -31,7 +32,7 @@ def _said_of(topic: str) -> Generator[None]:
     """A problem of a calibration message as one line that names its topic."""
     try:
         yield
-    except ValueError as error:
+    except (ValueError, StereoSfmError) as error:
         raise StereoSfmError(f"the calibration on {topic} cannot be used: {error}: {_OTHERWISE}") from None
 
 
@@ -51,9 +52,14 @@ def camera_of(info: CameraInfo, topic: str, rectified: bool) -> Camera:
 
 
 def stereo_rig(
-    left: CameraInfo, right: CameraInfo, topics: tuple[str, str], rectified: bool, transforms: Iterable[Transform]
+    left: CameraInfo,
+    right: CameraInfo,
+    topics: tuple[str, str],
+    rectified: bool,
+    transforms: Iterable[Transform],
+    warn: Warn = log.warning,
 ) -> Rig:
-    """The rig of both cameras with the extrinsics.
+    """The rig of both cameras with the extrinsics; what is odd about it goes to `warn`.
 
     The transforms between the cameras' frames go before R and P of raw images, after P of rectified ones.
 
@@ -64,22 +70,36 @@ def stereo_rig(
     for info, topic in zip((left, right), topics, strict=True):
         with _said_of(topic):
             cameras.append(info.camera(rectified))
-    cameras = believable(cameras, topics[0])
+    cameras = believable(cameras, topics[0], warn)
     with _said_of(topics[1]):
         stated = extrinsics(left, right, rectified)
     known = list(transforms)
     measured = chain(known, left.frame, right.frame)
-    if measured is not None and (stated is None or not rectified):
-        return Rig(cameras[0], cameras[1], measured)
-    if stated is None:
+    if measured is None and stated is None:
         raise StereoSfmError(_missing(left, right, topics, known))
-    if not rectified and any(camera.distortion for camera in cameras):
-        stated = _with_rotation(left, right, topics, stated, known)
-    return Rig(cameras[0], cameras[1], stated)
+    if stated is not None and (measured is None or rectified):
+        distorted = not rectified and any(camera.distortion for camera in cameras)
+        measured = _with_rotation(left, right, topics, stated, known, warn) if distorted else stated
+    assert measured is not None
+    with _said_of(topics[1]):
+        return Rig(cameras[0], cameras[1], measured)
+
+
+def other_reading(
+    left: CameraInfo, right: CameraInfo, topics: tuple[str, str], rectified: bool, transforms: Iterable[Transform]
+) -> tuple[str, Rig] | None:
+    """What the messages say of images that are, against their topics' names, rectified or not; None if that is the
+    same, or cannot be. With it goes what that would mean, for a message."""
+    if rectified and not any((*left.coefficients, *right.coefficients)):
+        return None
+    text = "are not rectified, although their topics' names say so" if rectified else "are rectified already"
+    with suppress(StereoSfmError):
+        return f"the images {text}", stereo_rig(left, right, topics, not rectified, transforms, lambda *_: None)
+    return None
 
 
 def _missing(left: CameraInfo, right: CameraInfo, topics: tuple[str, str], transforms: list[Transform]) -> str:
-    frames = sorted({name for t in transforms for name in (t.parent, t.child)})
+    frames = sorted({name for t in transforms for name in (t.parent, t.child)} - {""})
     there = f"the transforms are of {', '.join(frames[:12])}" if frames else "there are no transforms"
     if left.frame == right.frame:
         return (
@@ -90,7 +110,7 @@ def _missing(left: CameraInfo, right: CameraInfo, topics: tuple[str, str], trans
 
 
 def _with_rotation(
-    left: CameraInfo, right: CameraInfo, topics: tuple[str, str], stated: F64, transforms: list[Transform]
+    left: CameraInfo, right: CameraInfo, topics: tuple[str, str], stated: F64, transforms: list[Transform], warn: Warn
 ) -> F64:
     """What R and P state of raw images; with no rotation in R, that of two other frames as far apart as P says.
 
@@ -101,11 +121,9 @@ def _with_rotation(
     found = _pairs_apart(transforms, float(np.linalg.norm(stated[:3, 3])))
     if len(found) == 1:
         (names, transform), *_ = found.items()
-        log.warning("%s and %s have no rotation in R: it is taken from the transform of %s to %s", *topics, *names)
+        warn("%s and %s have no rotation in R: it is taken from the transform of %s to %s", *topics, *names)
         return transform
-    log.warning(
-        "%s and %s have no rotation in R, and no transform tells it: 'stereo-sfm check-calib' measures it", *topics
-    )
+    warn("%s and %s have no rotation in R, and no transform tells it: 'stereo-sfm check-calib' measures it", *topics)
     return stated
 
 
@@ -126,9 +144,11 @@ def _pairs_apart(transforms: list[Transform], baseline: float) -> dict[tuple[str
 def chain(transforms: list[Transform], parent: str, child: str) -> F64 | None:
     """parent_T_child through a tree of transforms (shortest path), None when they are not connected or the same."""
     edges: dict[str, dict[str, F64]] = {}
+    parent, child = parent.lstrip("/"), child.lstrip("/")  # as ROS 1 takes them
     for t in transforms:
-        edges.setdefault(t.parent, {}).setdefault(t.child, t.matrix)
-        edges.setdefault(t.child, {}).setdefault(t.parent, se3.inverse(t.matrix))
+        above, below = t.parent.lstrip("/"), t.child.lstrip("/")
+        edges.setdefault(above, {}).setdefault(below, t.matrix)
+        edges.setdefault(below, {}).setdefault(above, se3.inverse(t.matrix))
     found: dict[str, F64] = {parent: np.eye(4)}
     queue = deque([parent])
     while queue:

@@ -41,6 +41,21 @@ class ChosenTopics:
     cameras: tuple[str, ...]
     transforms: tuple[str, ...]
 
+    @property
+    def other(self) -> str:
+        """Of the images that belong to the left ones."""
+        return self.right or self.depth
+
+    @property
+    def images(self) -> list[str]:
+        """The left topic, and the other one if there is any."""
+        return [topic for topic in (self.left, self.other) if topic]
+
+    @property
+    def samples(self) -> list[str]:
+        """Of sensors beside the cameras."""
+        return [*self.imu, *([self.wheel] if self.wheel else [])]
+
 
 def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str = "", wheel: str = "") -> ChosenTopics:
     """Find the image topics.
@@ -142,7 +157,10 @@ def _pair(name: str, candidates: list[str], cameras: tuple[str, ...]) -> tuple[s
     if len(candidates) == 1:
         return candidates[0], ""
     if len(candidates) == 2:
-        log.warning("%s: assuming %s is the left camera and %s the right one", name, *sorted(candidates))
+        log.warning(
+            "%s: assuming %s is the left camera and %s the right one: choose with '?left=TOPIC&right=TOPIC'",
+            name, *sorted(candidates),
+        )  # fmt: skip
         return sorted(candidates)[0], sorted(candidates)[1]
     raise StereoSfmError(
         f"{name} has {len(candidates)} image topics with ambiguous names: "

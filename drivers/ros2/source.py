@@ -25,7 +25,6 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.live.buffers import Handoff, WheelBuffer
 from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import DeviceLost, NotFound
-from stereo_sfm.drivers.mcap.foreign import take_imu
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
@@ -38,7 +37,8 @@ from stereo_sfm.drivers.mcap.messages import (
     Transform,
     half_of,
 )
-from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
+from stereo_sfm.drivers.mcap.rig import camera_of, chain, other_reading, stereo_rig
+from stereo_sfm.drivers.mcap.samples import take_imu
 from stereo_sfm.drivers.mcap.topics import camera_topic, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource
@@ -113,6 +113,7 @@ class Ros2Source(BaseSource):
         self.name = f"ros2:{','.join(self._topics)}"
         self._pairs = _Pairs(bool(options.right), int(options.skew_ms * 1e6), self._counters)
         self._infos: dict[str, CameraInfo] = {}
+        self._calibrations: tuple[str, str] | None = None  # topics of both cameras', where these are used
         self._transforms: list[Transform] = []
         self._imu: list[ImuReading] = []
         self._imu_lock = threading.Lock()
@@ -253,7 +254,14 @@ class Ros2Source(BaseSource):
         if len(infos) == 1:
             return Rig(camera_of(infos[0], names[0], rectified))
         self._await_transform(infos[0].frame, infos[1].frame)
-        return stereo_rig(infos[0], infos[1], (names[0], names[1]), rectified, list(self._transforms))
+        self._calibrations = names[0], names[1]
+        return stereo_rig(infos[0], infos[1], self._calibrations, rectified, list(self._transforms))
+
+    def other_reading(self) -> tuple[str, Rig] | None:
+        if self._calibrations is None:
+            return None
+        left, right = (self._infos[name] for name in self._calibrations)
+        return other_reading(left, right, self._calibrations, is_rectified(self._topics[0]), list(self._transforms))
 
     def _as_published(self, topic: str) -> Any:
         """Calibrations are latched by some drivers, and sent with each image by others."""

@@ -32,8 +32,8 @@ class BagSource(ForeignSource):
 
     def stamps(self) -> Stamps:
         listed = super().stamps()
-        names = [*self.topics.imu, *([self.topics.wheel] if self.topics.wheel else [])]
-        others = {t: np.array([r.log_time for r in self.reader.messages([t])], np.int64) for t in names}
+        samples = self.topics.samples
+        others = {t: np.array([r.log_time for r in self.reader.messages([t])], np.int64) for t in samples}
         return replace(listed, others=others)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, by_stamp, folder_of, need
 from stereo_sfm.drivers.ground_truth import read_tum, stamp_from_seconds
 from stereo_sfm.drivers.image_lists import pair_by_stamp
 from stereo_sfm.drivers.rig_option import chosen_rig
@@ -48,7 +48,7 @@ def open_tum_rgbd(path: str, options: TumRgbdOptions) -> FolderSource:
         log.warning(
             "tum_rgbd:%s: %d of %d colour images have no depth image", label, len(colour) - len(pairs), len(colour)
         )
-    frames = [FrameFiles(colour[i][0], colour[i][1], depth=depth[j][1]) for i, j in pairs]
+    frames = by_stamp(FrameFiles(colour[i][0], colour[i][1], depth=depth[j][1]) for i, j in pairs)
     truth = folder / "groundtruth.txt"
     source = FolderSource(
         f"tum_rgbd:{label}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from stereo_sfm.drivers.video import VideoOptions
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import U8, StereoImage
 
+log = logging.getLogger("stereo_sfm")
+
 
 class VideoSource(BaseSource):
     """The frames of one or two files, with the stamps of the container."""
@@ -27,6 +30,12 @@ class VideoSource(BaseSource):
         captures = [_opened(path) for path in self._paths]
         counts = [int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) for capture in captures]
         self.frame_count = min(counts) if min(counts) > 0 else None
+        if self.frame_count and max(counts) > self.frame_count:
+            log.warning(
+                "%s: its files have %d and %d frames, which are paired from the first on: if the cameras did not begin "
+                "together, cut what is too much",
+                self.name, *counts,
+            )  # fmt: skip
         self._read(captures, 0)  # an error before the first frame
 
     def _prepare(self, name: str, options: VideoOptions) -> None:
@@ -74,7 +83,8 @@ class VideoSource(BaseSource):
             else:
                 raise StereoSfmError(
                     f"{self.name}: frames of {columns}x{rows} are neither two images of the calibration's "
-                    f"{width}x{height} side by side nor one above the other: use the calibration of these images"
+                    f"{width}x{height} side by side nor one above the other: use the calibration of these images, "
+                    "or give the other camera's file with '?right=FILE'"
                 )
         found = [np.ascontiguousarray(pixels) for pixels in (found[::-1] if self._swap else found)]
         for pixels, camera in zip(found, (self.rig.left, self.rig.right), strict=False):

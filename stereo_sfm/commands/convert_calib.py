@@ -39,10 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--unit",
         default=None,
         metavar="UNIT",
-        help="of the baseline, for opencv, ros and foxglove files: mm, cm, m, in, or metres (the squares' size)",
+        help="of the file's lengths: mm, cm, m, in, or metres (the size of a target's squares)",
     )
     parser.add_argument(
-        "--lens", default=None, metavar="MODEL", help="lens model, for the same files: plumb_bob, fisheye"
+        "--lens",
+        default=None,
+        metavar="MODEL",
+        help="lens model, for opencv, ros and foxglove files: plumb_bob, fisheye",
     )
     parser.add_argument(
         "--wheel", type=Path, default=None, metavar="FILE", help="the T265's calibration_odometry.json, for the output"

@@ -17,7 +17,7 @@ from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
-from stereo_sfm.messages import Health, LogEnded, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, LogEnded, LogLine, SourceCounters, StageTimes
 from stereo_sfm.recording.describe import GAP
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import (
@@ -101,6 +101,7 @@ class RunRecord:
     closed: list[Closure] = field(default_factory=list[Closure])  # accepted by the loop closer
     failed_kf_ids: list[int] = field(default_factory=list[int])  # at which the loop closer failed
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper rejected
+    warnings: dict[str, None] = field(default_factory=dict[str, None])  # lines of all stages, mostly of the source
     start_check: StartCheck | None = None  # what the first images said about the calibration; None: they fit
     row_errors: RowErrors | None = None  # the last
     row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
@@ -132,6 +133,11 @@ class RunRecord:
     @_take.register
     def _put_dropped(self, dropped: Dropped) -> None:
         self.drops[dropped.where] = self.drops.get(dropped.where, 0) + dropped.count
+
+    @_take.register
+    def _put_line(self, line: LogLine) -> None:
+        if line.level == "WARNING":
+            self.warnings[line.text] = None
 
     @_take.register
     def _put_start_check(self, check: StartCheck) -> None:

@@ -70,6 +70,7 @@ def write_report(
     lines += ["![trajectory](trajectory.png)", ""] if "trajectory" in drawings else []
     lines += ["## Verdict", "", *(f"* {verdict}" for verdict in judged), ""]
     lines += ["## Summary", "", *(f"* {line}" for line in summary(stats, evaluations))]
+    lines += _warnings(stats)
     for name, result in evaluations.items():
         lines += ["", f"## {name.capitalize()} against ground truth", "", "| | |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in table(result)]
@@ -170,6 +171,13 @@ def _plots_by_name(
         stages = [stage for stage in stats["ms"] if stage != "latency"]
         drawings["times"] = lambda: plots.plot_times(folder / "times.png", record, stages)
     return drawings
+
+
+def _warnings(stats: dict[str, Any]) -> list[str]:
+    """What was odd about the source and left out or mended, except what the summary says."""
+    said = stats["start_check"]["text"] if stats["start_check"] else None
+    lines = [line for line in stats["warnings"] if said is None or said not in line]
+    return ["", "## Warnings", "", *(f"* {line}" for line in lines)] if lines else []
 
 
 def _drops(stats: dict[str, Any]) -> list[str]:

@@ -83,6 +83,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "ms": stage_times(record),
         "health": {stage: _health(report) for stage, report in sorted(record.health.items())},
         "camera": record.source_counts,
+        "warnings": list(record.warnings),
         "start_check": start_check_stats(record),
         "calibration": calibration_stats(record),
         "sensor_calibration": sensor_stats(record),

@@ -18,12 +18,13 @@ from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.export.run_folder import KEPT_MAP, default_folder, discard_files, prepare_folder, refuse_taken
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import Compiling, LogEnded, Sink
+from stereo_sfm.messages import Compiling, LogEnded, LogLine, Sink
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
+from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.pipeline.threads import limited_threads
 from stereo_sfm.pipeline.viewer import ViewerOptions
 from stereo_sfm.types import Dropped, Frame, StartCheck
@@ -196,7 +197,9 @@ class Session:
         from stereo_sfm.pipeline.logger import LogSink
 
         self._compilation = stack.enter_context(listening(self._compiling))
-        with limited_threads(self._config.pipeline.threads):  # the start check gives the bits of the processes' one
+        lines: list[LogLine] = []
+        # The start check gives the bits of the processes' one.
+        with limited_threads(self._config.pipeline.threads), Listener("main", lines.append):
             source = stack.enter_context(self._opener())
             if isinstance(source, StartCheckedSource):
                 source.look()  # a camera's images as well: nothing in this process makes them wait
@@ -226,6 +229,9 @@ class Session:
             stack.callback(viewer.close)
             sinks.append(viewer)
         schedule = None if self._replayed is None else Recorded(self._replayed.applied)
+        for line in lines:  # they belong to no time of the log
+            for sink in self._sinks:
+                sink.put(line)
         for drop in self._ring_drops():
             for sink in sinks:
                 sink.put(drop)

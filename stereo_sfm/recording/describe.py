@@ -269,7 +269,7 @@ def _unseen(source: Source, count: int) -> tuple[list[str], list[str]]:
 def _against_calibration(source: Source) -> list[str]:
     """What the first images say against the calibration, as at the start of a run."""
     try:
-        found = check_start(source.rig, source)
+        found = check_start(source.rig, source, source.other_reading)
         found = with_sticking(found, source.rig, source.at(positions(source.frame_count)))
     except StereoSfmError as error:
         return [str(error)]

@@ -12,7 +12,7 @@ import yaml
 from stereo_sfm.calib import load_rig
 from stereo_sfm.calib.formats.camera_info import CameraInfo, infos_from_rig
 from stereo_sfm.drivers.mcap.messages import Transform
-from stereo_sfm.drivers.mcap.rig import camera_of, stereo_rig
+from stereo_sfm.drivers.mcap.rig import camera_of, other_reading, stereo_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole, RadTan, Tilted
@@ -100,6 +100,24 @@ def test_a_rotation_that_only_the_transforms_have(caplog: pytest.LogCaptureFixtu
     rig = stereo_rig(left, right, TOPICS, False, [])
     np.testing.assert_allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-12)
     assert "no transform tells it" in caplog.text
+
+
+def test_a_leading_slash_is_no_other_frame() -> None:
+    left, right = (replace(info, p=np.zeros((3, 4))) for info in pair())
+    apart = Transform(0, "/cam_l", "cam_r", RIG.left_T_right)
+    rig = stereo_rig(left, replace(right, frame="/cam_r"), TOPICS, False, [apart])
+    np.testing.assert_array_equal(rig.left_T_right, RIG.left_T_right)
+
+
+def test_the_other_reading_of_rectified_and_original_images() -> None:
+    left, right = pair()
+    for rectified in (False, True):
+        found = other_reading(left, right, TOPICS, rectified, [])
+        assert found is not None and ("not rectified" in found[0]) == rectified
+        assert isinstance(found[1].left, KannalaBrandt if rectified else Pinhole)
+    without = replace(left, coefficients=()), replace(right, coefficients=())
+    assert other_reading(*without, TOPICS, True, []) is None  # P is K turned by R
+    assert other_reading(left, replace(right, p=np.zeros((3, 4))), TOPICS, False, []) is None
 
 
 def test_transforms_between_the_cameras_go_before_p_of_raw_images() -> None:

@@ -317,7 +317,7 @@ def test_extrinsics_in_millimetres_are_refused() -> None:
     rig = fisheye_rig()
     far = rig.left_T_right.copy()
     far[:3, 3] *= 1000
-    with pytest.raises(StereoSfmError, match="give the extrinsics in metres, not millimetres"):
+    with pytest.raises(StereoSfmError, match=r"give the extrinsics in metres .*--unit mm"):
         replace(rig, left_T_right=far)
 
 

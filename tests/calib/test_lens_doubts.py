@@ -74,6 +74,22 @@ def test_convert_calib_takes_the_unit_and_the_lens(
     assert "--unit one of mm, cm, m, in or its length in metres" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["kalibr", "euroc", "basalt"])
+def test_other_formats_take_the_unit(tmp_path: Path, name: str) -> None:
+    rig, file = fisheye_rig(), tmp_path / ("folder" if name == "euroc" else "inches.json")
+    save_rig(far(rig, 1 / 0.0254), file, name)
+    assert load_rig(file, name, unit=0.0254).baseline == pytest.approx(rig.baseline, abs=1e-9)
+
+
+def test_millimetres_name_the_file_and_the_option(tmp_path: Path) -> None:
+    file = tmp_path / "settings.yaml"
+    sizes = "Camera.width: 640\nCamera.height: 480\n"
+    file.write_text(f"{sizes}Camera.fx: 500.\nCamera.fy: 500.\nCamera.cx: 320.\nCamera.cy: 240.\nCamera.bf: 50000.\n")
+    with pytest.raises(StereoSfmError, match=r"settings.yaml: .*baseline of 100 m.*--unit mm"):
+        load_rig(file)
+    assert load_rig(file, unit=1e-3).baseline == pytest.approx(0.1)
+
+
 def test_options_that_a_format_has_no_use_for(tmp_path: Path) -> None:
     save_rig(fisheye_rig(), tmp_path / "rig.yaml")
     with pytest.raises(StereoSfmError, match="format rig is read with no options, not with unit"):

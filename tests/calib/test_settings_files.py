@@ -108,10 +108,10 @@ def test_lenses_that_we_have_not_are_refused(model: str, tmp_path: Path) -> None
     """Also where the file lacks the focal length, which an equirectangular image has not."""
     stella = STELLA.replace('"perspective"', f'"{model}"')
     for text in (stella, f"Camera:\n  name: x\n  model: {model}\n  cols: 64\n  rows: 32\n"):
-        with pytest.raises(StereoSfmError, match=f"camera model '{model}' is not supported .*perspective, fisheye"):
+        with pytest.raises(StereoSfmError, match=f"Camera.model '{model}' is not supported .*perspective, fisheye"):
             of_text(tmp_path, text)
     orbslam = orbslam2_euroc().split("LEFT")[0] + f'Camera.type: "{model}"\n'
-    with pytest.raises(StereoSfmError, match=f"camera type '{model}' is not supported .*pinhole, rectified") as refused:
+    with pytest.raises(StereoSfmError, match=f"Camera.type '{model}' is not supported .*pinhole, rectified") as refused:
         of_text(tmp_path, orbslam)
     assert "\n" not in str(refused.value)
 
@@ -238,5 +238,5 @@ def test_any_two_cameras_of_a_chain(tmp_path: Path) -> None:
         np.testing.assert_allclose(rig.left_T_right[:3, 3], [right, 0, 0], atol=1e-12)
     with pytest.raises(StereoSfmError, match="key 'cam3' is missing"):
         of_text(tmp_path, text, pair=(0, 3))
-    with pytest.raises(StereoSfmError, match="format kalibr is read with pair, not with size"):
+    with pytest.raises(StereoSfmError, match="format kalibr is read with pair, unit, not with size"):
         of_text(tmp_path, text, size=(1, 2))

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
+from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.start import check_start
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
+from stereo_sfm.types import U8
 
 Change = Callable[[s.StereoImage], s.StereoImage]
 
@@ -22,6 +24,11 @@ Change = Callable[[s.StereoImage], s.StereoImage]
 def images() -> tuple[s.Rig, list[s.StereoImage]]:
     with s.open_source(s.demo_recording()) as source:
         return source.rig, list(islice(source, 13))
+
+
+def right_of(image: s.StereoImage) -> U8:
+    assert image.right is not None
+    return image.right
 
 
 def turned(image: np.ndarray) -> np.ndarray:
@@ -52,6 +59,14 @@ def test_an_inverted_transform_is_reported(images: tuple[s.Rig, list[s.StereoIma
     inverted = replace(rig, left_T_right=se3.inverse(rig.left_T_right))
     found = check_start(inverted, good)
     assert found.text.startswith("left_T_right is inverted: 0 stereo matches") and found.shown
+
+
+def test_a_transform_in_the_axes_of_a_robot_is_reported(pair: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, good = pair
+    optical_T_body = np.eye(4)
+    optical_T_body[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
+    found = check_start(replace(rig, left_T_right=optical_T_body.T @ rig.left_T_right @ optical_T_body), good)
+    assert "body's axes (x forwards)" in found.text and found.shown and found.rig is None
 
 
 def test_the_calibration_of_other_cameras_is_suspected(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
@@ -101,9 +116,9 @@ def test_small_errors_and_right_calibrations_stay(pair: tuple[s.Rig, list[s.Ster
     assert check_start(wrong(rig, z_deg=0.05), images).rig is None
 
 
-@pytest.mark.parametrize("shift", [-2, 1])
-def test_images_paired_frames_apart_are_found(data_root: Path, shift: int) -> None:
-    with s.open_source(data_root / "kitti") as source:
+@pytest.mark.parametrize(("name", "shift"), [("kitti", -2), ("kitti", 1), ("store_walk", 2)])
+def test_images_paired_frames_apart_are_found(data_root: Path, name: str, shift: int) -> None:
+    with s.open_source(data_root / name) as source:
         rig, images = source.rig, list(islice(source, 17))
     apart = [replace(images[k], right=images[k - shift].right) for k in range(2, 15)]
     found = check_start(rig, apart)
@@ -138,6 +153,22 @@ def test_a_lens_under_the_name_of_another_model(
     assert found.rig is not None and found.rig.right is not None
     assert (found.rig.left.model, found.rig.right.model) == (rig.left.model, rig.right.model)
     assert check_start(found.rig, images).text == ""
+
+
+@pytest.mark.parametrize("name", ["store_walk", "euroc_mh01"])
+@pytest.mark.parametrize("rectified", [False, True])
+def test_images_that_are_rectified_or_not_against_their_name(data_root: Path, name: str, rectified: bool) -> None:
+    with s.open_source(data_root / name) as source:
+        rig, images = source.rig, list(islice(source, 13))
+    rectification = rectify(rig, "pinhole", size=rig.left.size)
+    if rectified:
+        seen = [replace(i, left=a, right=b) for i in images for a, b in [rectification.apply(i.left, right_of(i))]]
+        given, meant = rig, rectification.rig
+    else:
+        seen, given, meant = images, rectification.rig, rig
+    found = check_start(given, seen, lambda: ("the images are otherwise", meant))
+    assert found.rig is meant and found.shown and "topics" in found.advice
+    assert check_start(meant, seen, lambda: ("the images are otherwise", given)).text == ""
 
 
 @pytest.mark.parametrize("name", ["store_walk", "euroc_mh01"])

@@ -67,6 +67,12 @@ def test_what_sticks_to_the_image_is_masked(images: list[s.StereoImage], change:
     assert left[edges > 0].mean() > 0.15 and left.mean() < 15 * changed.mean()
 
 
+def test_an_image_without_light_hides_nothing(images: list[s.StereoImage]) -> None:
+    """While the lamps are off, all that is seen sticks."""
+    stuck = [replace(image, left=text(image.left // 30 if k == 4 else image.left)) for k, image in enumerate(images)]
+    assert [part.any() for part in sticking(stuck)] == [True, False]
+
+
 def test_a_run_has_the_mask_and_says_so(data_root: Path) -> None:
     with s.open_source(data_root / "kitti") as source:
         rig, good = source.rig, list(source.at(positions(source.frame_count)))

@@ -84,7 +84,7 @@ class BagWriter:
         kind = "tf2_msgs/msg/TFMessage"
         self.put("/tf_static", kind, self.make(kind, [row]), stamp_ns)
 
-    def imu(self, stamp_ns: int, gyro: F64, accel: F64, topic: str = "/imu/data") -> None:
+    def imu(self, stamp_ns: int, gyro: F64, accel: F64, topic: str = "/imu/data", logged_ns: int | None = None) -> None:
         """NaN: not measured."""
         kind, zeros = "sensor_msgs/msg/Imu", np.zeros(9)
         covariance = [np.r_[-1.0, np.zeros(8)] if np.isnan(v).any() else zeros for v in (gyro, accel)]
@@ -92,7 +92,7 @@ class BagWriter:
         level = self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
         header = self.header(stamp_ns, FRAMES[2])
         message = self.make(kind, header, level, zeros, values[0], covariance[0], values[1], covariance[1])
-        self.put(topic, kind, message, stamp_ns)
+        self.put(topic, kind, message, stamp_ns if logged_ns is None else logged_ns)
 
     def wheels(self, kind: str, stamp_ns: int, linear: F64, angular: F64, speeds: F64) -> None:
         """Velocities of the robot (3,) each, or with JointState the speeds (2,) of its wheels, on /wheel_odom."""

@@ -541,6 +541,27 @@ def test_one_clock_where_a_camera_has_no_header_stamps(tmp_path: Path, caplog: p
         np.testing.assert_array_equal(image.right, _pixels(i, 1))  # of the same moment
 
 
+@pytest.mark.parametrize("apart_ns", [1000 * 10**9, -(10**9) + 20_000_000])
+def test_two_header_clocks_are_not_mixed(apart_ns: int, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = _write(tmp_path / "a.mcap", clocks=lambda i, side: (_taken(i) + side * apart_ns, _taken(i) + 1_000 * side))
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path) as source:
+        images = list(source)
+    assert "are of two clocks" in caplog.text and "Trigger" not in caplog.text
+    assert [image.stamp_ns for image in images] == [_taken(i) for i in range(6)]
+
+
+def test_a_camera_that_begins_later_has_the_same_clock(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = _write(tmp_path / "a.mcap", count=100, skip=[(i, 1) for i in range(90)])
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path) as source:
+        assert [image.stamp_ns for image in source] == [_taken(i) for i in range(90, 100)]
+    assert not caplog.text
+
+
+def test_cameras_that_were_recorded_one_after_the_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = _write(tmp_path / "a.mcap", count=20, skip=[(i, i >= 10) for i in range(20)])
+    assert "no image of /stereo/left/image_raw has a partner on /stereo/right/image_raw" in _error(path, capsys)
+
+
 def test_no_clock_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "nothing tells when" in _error(_write(tmp_path / "a.mcap", clocks=lambda i, side: (0, 10**9)), capsys)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import logging
 import shutil
 from pathlib import Path
 
@@ -155,6 +156,25 @@ def test_separate_topics_of_gyroscope_and_accelerometer(tmp_path: Path) -> None:
     np.testing.assert_array_equal(gyro[::2, 2], np.arange(10))
     np.testing.assert_array_equal(accel[1::2, 1], np.arange(10))
     assert np.isnan(gyro[1::2]).all() and np.isnan(accel[::2]).all()
+
+
+def test_a_sensor_of_another_clock_is_left_out_and_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    source, images = _simulated()
+    up = np.array([0.0, 0.0, 9.8])
+
+    def later(bag: BagWriter) -> None:
+        for i in images:
+            bag.imu(i.stamp_ns + 10**18, np.zeros(3), up, logged_ns=i.stamp_ns)
+
+    plain = [StereoImage(i.frame_id, i.stamp_ns, i.left, i.right) for i in images]
+    path = write_bag(tmp_path, KINDS[0], source.rig, plain, extra=later)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path) as bag:
+        assert bag.rig.imu is None and all(image.imu is None for image in bag)
+    why = "the stamps of /imu/data are 1e+09 s away from the images': another clock"
+    assert why in caplog.text
+    out = tmp_path / "run"
+    assert main(["run", str(path), "--inline", "-q", "-o", str(out), "--log", "none"]) == 0
+    assert why in (out / "report.md").read_text()  # although it was said before the run began
 
 
 @pytest.mark.parametrize("kind", KINDS)

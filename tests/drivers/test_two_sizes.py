@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from stereo_sfm.calib import Rig, save_rig
 from stereo_sfm.calib.lens_doubts import doubts
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.system import Tracker
@@ -73,3 +75,17 @@ def test_folders_of_two_sizes(tmp_path: Path) -> None:
     save_rig(scaled(rig, 1 / 0.75), tmp_path / "rig.yaml")
     with pytest.raises(StereoSfmError, match="is 159x150 but the calibration is for 212x200"):
         open_source(tmp_path)
+
+
+def test_sizes_are_doubted_where_the_images_stay_as_they_are(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with open_source("sim:loop?size=212x200&frames=2") as source:
+        images, rig = list(source), scaled(source.rig, 0.5)
+    for k, image in enumerate(images):
+        for side, pixels in (("left", image.left), ("right", resized(image, rig))):
+            (tmp_path / side).mkdir(exist_ok=True)
+            cv2.imwrite(str(tmp_path / side / f"{k:06d}.png"), pixels)
+    save_rig(rig, tmp_path / "rig.yaml")
+    for how in ("none", "wide"):
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "stereo_sfm"), SourceChoice.of(tmp_path, rectify=how)():
+            assert ("0.5 times as large" in caplog.text) == (how == "none")

@@ -13,6 +13,7 @@ from stereo_sfm.calib import save_rig
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.side_names import side_pairs
 from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.drivers.images.source import find_pair
 from stereo_sfm.drivers.mcap.topics import is_rectified
 from stereo_sfm.drivers.times_file import read_times
@@ -101,6 +102,9 @@ def test_recordings_side_by_side_are_no_pair(tmp_path: Path) -> None:
         ("left/a.png;1.5\nleft/b.png;2.5\n", [1_500_000_000, 2_500_000_000], ["a", "b"]),
         ("1 2 3.5", [1_000_000_000, 2_000_000_000, 3_500_000_000], []),
         ("0\n1\n2\n", [0, 1_000_000_000, 2_000_000_000], []),
+        ("1403636579763\n1403636579813\n", [NS // 10**6 * 10**6, 1403636579813000000], []),  # milliseconds
+        ("1403636579763555\n1403636579813555\n", [NS // 1000 * 1000, 1403636579813555000], []),  # microseconds
+        ("5000000000\n5033000000\n", [5_000_000_000, 5_033_000_000], []),  # nanoseconds since the camera's start
     ],
 )  # fmt: skip
 def test_lists_of_times(text: str, stamps: list[int], names: list[str], tmp_path: Path) -> None:
@@ -112,9 +116,32 @@ def test_lists_of_times(text: str, stamps: list[int], names: list[str], tmp_path
 
 def test_a_list_without_times(tmp_path: Path) -> None:
     path = tmp_path / "times.txt"
-    path.write_text("one\ntwo\n")
-    with pytest.raises(StereoSfmError, match="one time in seconds or nanoseconds"):
-        read_times(path)
+    for text in ("one\ntwo\n", "nan\n1.5\n2.5\n"):
+        path.write_text(text)
+        with pytest.raises(StereoSfmError, match="one time in seconds or a smaller unit"):
+            read_times(path)
+
+
+def test_times_that_were_set_back_keep_the_order_of_the_images(tmp_path: Path) -> None:
+    for level, name in ((50, "left"), (150, "right")):
+        write(tmp_path / name, [f"{k}.png" for k in range(8)], level)
+    (tmp_path / "times.txt").write_text("".join(f"{10 + 0.1 * k - 2 * (k >= 4):.1f}\n" for k in range(8)))
+    save_rig(stereo_rig(), tmp_path / "rig.yaml")
+    with SourceChoice(str(tmp_path))() as source:
+        images = list(source)
+    assert [image.frame_id for image in images] == list(range(8))
+    assert [image.stamp_ns // 10**8 for image in images] == list(range(100, 108))
+
+
+def test_what_is_missing_is_told_with_the_option_that_gives_it(tmp_path: Path) -> None:
+    write(tmp_path / "image_00" / "data", ["0.png"], 50)
+    write(tmp_path / "image_01" / "data", ["0.png"], 150)
+    (tmp_path / "image_00" / "timestamps.txt").write_text("2011-09-26 13:02:25.964389445\n")
+    with pytest.raises(StereoSfmError, match=r"no KITTI raw calibration at .* give a calibration with --rig FILE"):
+        open_source(tmp_path)
+    write(tmp_path / "east", ["0.png"], 50)
+    with pytest.raises(StereoSfmError, match=r"not a known kind .*left=FOLDER&right=FOLDER"):
+        open_source(tmp_path / "east")
 
 
 def test_words_not_letters_tell_rectified_images() -> None:

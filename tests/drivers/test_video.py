@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import cv2
@@ -65,6 +66,14 @@ def test_a_given_rate(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mkv", [np.concatenate([view(k, 0), view(k, 1)], 1) for k in range(3)])
     with opened(path, fps=4.0) as source:
         assert [image.stamp_ns for image in source] == [0, 250_000_000, 500_000_000]
+
+
+def test_files_of_two_lengths_are_doubted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    right = write(tmp_path / "right.mkv", [view(k, 1) for k in range(3)])
+    left = write(tmp_path / "left.mkv", [view(k, 0) for k in range(5)])
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), opened(left, right=str(right)) as source:
+        assert source.frame_count == len(list(source)) == 3
+    assert "have 5 and 3 frames, which are paired from the first on" in caplog.text
 
 
 def test_what_is_refused(tmp_path: Path) -> None:
