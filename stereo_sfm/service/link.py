@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
@@ -21,6 +21,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.channels import DroppingOutbox
 from stereo_sfm.pipeline.text import LOGGER, emit
+from stereo_sfm.pipeline.watchdog import HEARTBEAT_S, SILENT_S, HeartbeatThread, Watchdog
 from stereo_sfm.service.child import Send, pipe, run_child, start_child
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import ServiceMessage
@@ -128,14 +129,29 @@ class OutputProcess:
         self.starts += 1
         self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT)
         self._replies = DroppingOutbox(to_client, LIMIT)
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                self._take(reports.recv())
+        assert process.pid is not None
+        self._listen(reports, process, Watchdog({self.name: process.pid}, log.warning, SILENT_S))
         self.wants = frozenset()
         reports.close()
         for outbox in (self._outbox, self._replies):
             outbox.close()
         process.join()
+
+    def _listen(self, reports: Connection, process: BaseProcess, watchdog: Watchdog) -> None:
+        """Until the process ends; one that does not respond is killed, also while it starts."""
+        checked_s = time.monotonic()
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                if wait([reports], HEARTBEAT_S):
+                    message = reports.recv()
+                    watchdog.received(self.name, message)
+                    self._take(message)
+                passed_s = time.monotonic() - checked_s
+                checked_s += passed_s
+                if passed_s > 2 * HEARTBEAT_S:  # this process stood still itself
+                    watchdog.excuse(passed_s)
+                elif watchdog.silent([self.name]) and not self._closing.is_set():
+                    process.kill()
 
     def _take(self, message: object) -> None:
         if isinstance(message, _Opened):
@@ -191,7 +207,13 @@ def run_output(
 ) -> None:
     """Body of the process of an output."""
 
+    name = module.partition(":")[0].rpartition(".")[2]
+
     def body(send: Send) -> None:
+        with HeartbeatThread(name, send):
+            publish(send)
+
+    def publish(send: Send) -> None:
         publisher = make_publisher(module, config)
         if not _open(publisher, PipeClient(send, replies), messages):
             return
@@ -201,7 +223,7 @@ def run_output(
                 publisher.put(pickle.loads(messages.recv_bytes()))
         publisher.close()
 
-    run_child(f"output {module.partition(':')[0].rpartition('.')[2]}", to_main, body, tidy=True)
+    run_child(f"output {name}", to_main, body, tidy=True)
 
 
 def make_publisher(module: str, config: RobotConfig) -> Publisher:
