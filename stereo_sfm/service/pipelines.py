@@ -16,6 +16,7 @@ from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_keeper import MapKeeper
 from stereo_sfm.service.recorder import Recorder
+from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.session import Session
 from stereo_sfm.service.states import Facts
 
@@ -47,6 +48,7 @@ class Pipelines:
         self._opener, self._config, self._silent_s = opener, config, silent_s
         self._maps, self._recorder, self._hub = maps, recorder, hub
         self._facts, self._health = facts, health
+        self._mounting = RobotMounting()
         self.session: Session | None = None  # the one that runs
         self.count = 0  # pipelines started so far
         self._restarting = False  # the pipeline is stopped to be started again
@@ -117,7 +119,8 @@ class Pipelines:
             return False
         session = self.session = Session(
             self.count, self._opener, self._config, folders, self._hub, self._facts, self._health,
-            self._silent_s, self._recorder, self._maps.session_saved,
+            self._silent_s, self._recorder, self._maps.session_saved, self._mounting,
+            None if self._maps.mode == "none" else self._maps.folder,
         )  # fmt: skip
         if self.stopping.is_set():
             return True

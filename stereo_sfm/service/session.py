@@ -21,6 +21,7 @@ from stereo_sfm.service.map_cloud import MapCloudBuilder
 from stereo_sfm.service.messages import Event, PoseUpdate, PreviewImage, Started
 from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
+from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.states import Facts
 from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations
 
@@ -44,11 +45,13 @@ class Session:
         silent_s: float,
         recorder: Recorder,
         map_saved: Callable[[MapSaved], None],
+        mounting: RobotMounting,
+        map_folder: Path | None,
     ) -> None:
         opener = with_start_check(opener, config.self_calibration.mode == "auto")
         self.number, self._opener, self._config, self._folders = number, opener, config, folders
         self._hub, self._facts, self._health, self._map_saved = hub, facts, health, map_saved
-        self._recorder = recorder
+        self._recorder, self._mounting, self._map_folder = recorder, mounting, map_folder
         self._clock = HostClock()
         self._observations = Observations.empty()  # of the newest frame
         self._next_preview_s = 0.0
@@ -104,11 +107,12 @@ class Session:
             with self._run as run:
                 info = run.info
                 self.serial, self._clock.live = info.rig.serial, info.live
-                self._poses = PoseConverter(info.rig, self.number, self._clock)
+                rig = self._mounting.begin(info.rig, self._map_folder)
+                self._poses = PoseConverter(rig, self.number, self._clock)
                 self._corrections = CorrectionKeeper(self._opener.camera_store, info.rig, info.given_rig)
                 opening = self._folders.opening(self._opener.opening(info.rig))
                 self._recorder.begin(run, self._config, self._opener.spec or info.name, opening)
-                self._hub.publish(Started(self.number, info.name, info.rig, info.live))
+                self._hub.publish(Started(self.number, info.name, rig, info.live))
                 for _ in run:
                     pass
         except KeyboardInterrupt:  # `stop` while the source was being opened
@@ -180,6 +184,10 @@ class Session:
 
     def _keyframe(self, keyframe: Keyframe) -> None:
         self._map.put(keyframe)
+        rig = self._mounting.keyframe(keyframe)
+        if rig is not None and self._poses is not None:
+            self._poses.mount(rig)
+            self._hub.publish(Started(self.number, self._run.info.name, rig, self._run.info.live))
 
     def _update(self, update: MapUpdate) -> None:
         assert self._poses is not None
