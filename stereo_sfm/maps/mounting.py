@@ -64,7 +64,7 @@ class Mounting:
         """(4, 4) the camera on a body with its origin in it: x ahead, y to the left, z up."""
         ahead = np.array([0.0, 0.0, 1.0]) - self.up[2] * self.up
         ahead /= np.linalg.norm(ahead)
-        rotation = np.stack([ahead, np.cross(self.up, ahead), self.up])
+        rotation: F64 = np.array([ahead, np.cross(self.up, ahead), self.up], np.float64)
         return se3.from_rotation_translation(rotation, np.zeros(3))
 
 

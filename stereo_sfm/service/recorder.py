@@ -231,6 +231,7 @@ class Recorder:
         if process is not None:
             process.join(CLOSE_S + 0.5)
             if process.is_alive():
-                log.warning("the recorder did not end in time: the last seconds may be missing")
+                if self.state.recording:
+                    log.warning("the recorder did not end in time: the last seconds may be missing")
                 process.kill()
                 process.join()
