@@ -13,7 +13,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
@@ -25,6 +25,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.outputs.access import Access, Bucket, Links, TooManyAttempts
 from stereo_sfm.service.outputs.door import HANDSHAKE_S
 from stereo_sfm.service.outputs.guard import Guard, refusal
+from stereo_sfm.service.page import playback
 from stereo_sfm.service.page.settings_form import settings_form
 from stereo_sfm.service.page.state import PageState
 from stereo_sfm.service.page.verdicts import Verdicts
@@ -49,6 +50,7 @@ MOST_VIEWERS = 16
 REPLY_S = 30.0  # more than the service takes for any command
 
 Handler = Callable[[Request], Awaitable[Response]]
+T = TypeVar("T")
 
 
 class Page:
@@ -73,6 +75,8 @@ class Page:
             ("/api/settings", self._settings),
             ("/api/recordings", self._recordings),
             ("/api/recordings/{id}", self._files),
+            ("/api/recordings/{id}/timeline", self._timeline),
+            ("/api/recordings/{id}/thumbnails/{number:int}", self._thumbnail),
             ("/api/recordings/{id}/{number:int}", self._download),
         ]
         routes = [Route(path, self._file) for path in FILES]
@@ -179,6 +183,29 @@ class Page:
         if not path.is_file():
             return refusal(404, "the file no longer exists")
         return FileResponse(path, filename=f"{path.parent.name}_{path.name}", media_type="application/octet-stream")
+
+    async def _timeline(self, request: Request) -> Response:
+        """Seconds of a recording's thumbnails."""
+        found = await self._played(request, playback.timeline)
+        return found if isinstance(found, Response) else JSONResponse(found)
+
+    async def _thumbnail(self, request: Request) -> Response:
+        number = request.path_params["number"]
+        found = await self._played(request, lambda folder: playback.thumbnail(folder, number))
+        if isinstance(found, Response):
+            return found
+        kept = {"Cache-Control": "private, max-age=3600"}
+        return Response(found, media_type="image/jpeg", headers=kept) if found else Response(status_code=204)
+
+    async def _played(self, request: Request, read: Callable[[Path], T]) -> T | Response:
+        """What is read from a recording's folder, or why it cannot be."""
+        folder = await run_in_threadpool(self._folder_of, request.path_params["id"])
+        if folder is None:
+            return refusal(404, "no such recording")
+        try:
+            return await run_in_threadpool(read, folder)
+        except (StereoSfmError, OSError) as error:
+            return refusal(404, str(error))
 
     async def _command(self, request: Request) -> Response:
         name = request.path_params["name"]
