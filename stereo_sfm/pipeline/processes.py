@@ -423,7 +423,7 @@ class ProcessRun:
         Args: folder, replaced. urgent: the run is about to be stopped, which then waits for it up to `SAVE_END_S`.
         """
         self._saving_at_end |= urgent
-        self._request("mapper", SaveMap(folder, urgent))
+        self._request("mapper", SaveMap(folder))
 
     def has_ended(self, stage: str) -> bool:
         """Whether a stage came to its end by itself."""
