@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
@@ -21,8 +21,8 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.channels import DroppingOutbox
 from stereo_sfm.pipeline.text import LOGGER, emit
-from stereo_sfm.pipeline.watchdog import HEARTBEAT_S, SILENT_S, HeartbeatThread, Watchdog
-from stereo_sfm.service.child import Send, pipe, run_child, start_child
+from stereo_sfm.pipeline.watchdog import HeartbeatThread
+from stereo_sfm.service.child import Send, follow, pipe, run_child, start_child
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import ServiceMessage
 from stereo_sfm.service.outputs import OUTPUTS
@@ -129,29 +129,12 @@ class OutputProcess:
         self.starts += 1
         self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT)
         self._replies = DroppingOutbox(to_client, LIMIT)
-        assert process.pid is not None
-        self._listen(reports, process, Watchdog({self.name: process.pid}, log.warning, SILENT_S))
+        follow(self.name, process, reports, self._take)
         self.wants = frozenset()
         reports.close()
         for outbox in (self._outbox, self._replies):
             outbox.close()
         process.join()
-
-    def _listen(self, reports: Connection, process: BaseProcess, watchdog: Watchdog) -> None:
-        """Until the process ends; one that does not respond is killed, also while it starts."""
-        checked_s = time.monotonic()
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                if wait([reports], HEARTBEAT_S):
-                    message = reports.recv()
-                    watchdog.received(self.name, message)
-                    self._take(message)
-                passed_s = time.monotonic() - checked_s
-                checked_s += passed_s
-                if passed_s > 2 * HEARTBEAT_S:  # this process stood still itself
-                    watchdog.excuse(passed_s)
-                elif watchdog.silent([self.name]) and not self._closing.is_set():
-                    process.kill()
 
     def _take(self, message: object) -> None:
         if isinstance(message, _Opened):
