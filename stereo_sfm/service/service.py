@@ -159,7 +159,7 @@ class Service(Commands):
 
     def _check(self) -> None:
         """Each on its own: the state and the saved map depend on the thread that does this."""
-        for check in (self._check_maps, self._reporter.report):
+        for check in (self._check_maps, self._pipelines.check, self._reporter.report):
             try:
                 check()
             except Exception:

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.calib.camera_store import CorrectionKeeper
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import Opener, with_start_check
+from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
+from stereo_sfm.pipeline.standby import Standby
 from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_cloud import MapCloudBuilder
@@ -23,7 +25,7 @@ from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.states import Facts
-from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations
+from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations, StartCheck
 
 log = logging.getLogger("stereo_sfm")
 
@@ -47,8 +49,8 @@ class Session:
         map_saved: Callable[[MapSaved], None],
         mounting: RobotMounting,
         map_folder: Path | None,
+        standby: Callable[[], Standby | None] = lambda: None,
     ) -> None:
-        opener = with_start_check(opener, config.self_calibration.mode == "auto")
         self.number, self._opener, self._config, self._folders = number, opener, config, folders
         self._hub, self._facts, self._health, self._map_saved = hub, facts, health, map_saved
         self._recorder, self._mounting, self._map_folder = recorder, mounting, map_folder
@@ -57,6 +59,7 @@ class Session:
         self._next_preview_s = 0.0
         self.serial = ""  # of the camera
         self.localized = False
+        self.start_check: StartCheck | None = None  # what its first images said about the calibration
         self.frames = 0
         self._first_frame_s = float("inf")
         self._handlers: dict[type[Any], Callable[[Any], None]] = {
@@ -67,6 +70,7 @@ class Session:
             MapSaved: self._map_saved,
             LogLine: self._line,
             Compiling: self._compiling,
+            StartCheck: self._checked,
         }
         self._poses: PoseConverter | None = None
         self._corrections: CorrectionKeeper | None = None
@@ -79,6 +83,7 @@ class Session:
             images=self._image,
             silent_s=silent_s,
             pose_first=number > 1,  # a robot may be moving
+            standby=standby,
         )
 
     @property
@@ -131,6 +136,11 @@ class Session:
         Args: folder, replaced. urgent: the session is about to be stopped.
         """
         self._run.save_map(folder, urgent)
+
+    @property
+    def rig(self) -> Rig:
+        """Of its source, once it has frames."""
+        return self._run.info.rig
 
     def relocalize(self) -> None:
         """Search the whole saved map with the next keyframe."""
@@ -203,6 +213,9 @@ class Session:
         self._poses.localized(message)
         self._map.localized(message.version)
         log.info("the saved map was recognised: poses are in its frame")
+
+    def _checked(self, check: StartCheck) -> None:
+        self.start_check = check
 
     def _compiling(self, _: Compiling) -> None:
         """The first start after an installation takes up to minutes: the state says why."""
