@@ -199,11 +199,9 @@ class Page:
 
     async def _played(self, request: Request, read: Callable[[Path], T]) -> T | Response:
         """What is read from a recording's folder, or why it cannot be."""
-        folder = await run_in_threadpool(self._folder_of, request.path_params["id"])
-        if folder is None:
-            return refusal(404, "no such recording")
         try:
-            return await run_in_threadpool(read, folder)
+            folder = await run_in_threadpool(self._folder_of, request.path_params["id"])
+            return refusal(404, "no such recording") if folder is None else await run_in_threadpool(read, folder)
         except (StereoSfmError, OSError) as error:
             return refusal(404, str(error))
 
