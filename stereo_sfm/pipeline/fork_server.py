@@ -67,6 +67,14 @@ def _watch(over: threading.Event) -> None:
         stopped_s = 0.0
 
 
+def kill_fork_server() -> None:
+    """Whoever waits for it gets an end of file; the next start begins another one."""
+    pid = _helpers()[0]
+    if pid is not None:
+        with contextlib.suppress(OSError):
+            os.kill(pid, signal.SIGKILL)
+
+
 def resume_helpers() -> None:
     """Let the processes of multiprocessing go on that a signal has stopped: they could not end with this one."""
     for pid in _helpers():

@@ -159,6 +159,8 @@ class ProcessRun:
             self._stages.resume(stage)
         if self._set_up_sent:
             self._stages.request("capture", "stop")
+        else:
+            self._stages.give_up()
         with contextlib.suppress(OSError):  # the whole run has ended
             self._wake.send("stop")
 

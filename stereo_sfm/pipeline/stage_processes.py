@@ -15,11 +15,12 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline import child
 from stereo_sfm.pipeline.channels import Outbox
-from stereo_sfm.pipeline.fork_server import resume_helpers, start_context, watched_start
+from stereo_sfm.pipeline.fork_server import kill_fork_server, resume_helpers, start_context, watched_start
 from stereo_sfm.pipeline.interrupts import ignored_by_children
 from stereo_sfm.pipeline.threads import thread_environment
 
 EXIT_S = 1.0  # time for the processes to exit after their last messages
+ATTEMPTS, ATTEMPT_S = 5, 0.2  # to start a stage: a fork server that was killed takes a moment to be gone
 MIN_OPEN_FILES = 128  # per process
 ANY_NUMBER = 0  # of requests that wait: main never waits for a stage that does not read them
 
@@ -38,6 +39,7 @@ class StageProcesses:
         self.processes: dict[str, BaseProcess] = {}
         self.reports: dict[Connection, str] = {}
         self._controls: dict[str, Outbox] = {}
+        self._starting = self._given_up = False
 
     def pipe(self) -> tuple[Connection, Connection]:
         """(receiving end, sending end)."""
@@ -55,11 +57,35 @@ class StageProcesses:
             daemon=True,
         )  # fmt: skip
         with ignored_by_children(), thread_environment(self._threads), watched_start():
-            _start(process)
+            self._start(process)
         to_main.close()
         control.close()
         self.processes[stage] = process
         self.reports[report] = stage
+
+    def _start(self, process: BaseProcess) -> None:
+        """Raises:
+        StereoSfmError: the fork server was killed, and so were those after it.
+        KeyboardInterrupt: `give_up` was called.
+        """
+        self._starting = True
+        try:
+            for _ in range(ATTEMPTS):
+                if self._given_up:
+                    raise KeyboardInterrupt
+                with contextlib.suppress(EOFError, ConnectionError):
+                    process.start()
+                    return
+                time.sleep(ATTEMPT_S)
+        finally:
+            self._starting = False
+        raise StereoSfmError("the process that starts the stages was killed again and again")
+
+    def give_up(self) -> None:
+        """Start no more stages, and wait no longer for the fork server, which may still load its code."""
+        self._given_up = True
+        if self._starting:
+            kill_fork_server()
 
     @property
     def pids(self) -> dict[str, int]:
@@ -127,15 +153,6 @@ class StageProcesses:
             for end in (*self.reports, *self._controls.values()):
                 end.close()
             self.reports.clear()
-
-
-def _start(process: BaseProcess) -> None:
-    """Raises: StereoSfmError: the fork server was killed, and so was the one after it."""
-    for _ in range(2):
-        with contextlib.suppress(EOFError, ConnectionError):
-            process.start()
-            return
-    raise StereoSfmError("the process that starts the stages was killed twice")
 
 
 def raise_file_limit(least: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import threading
 import time
 from typing import Any
 
@@ -66,3 +67,20 @@ def test_a_stage_that_reads_nothing_blocks_neither_requests_nor_the_end() -> Non
         begin = time.monotonic()
         stages.close(set())
     assert time.monotonic() - begin < END_S
+
+
+def test_giving_up_ends_a_start_that_waits_for_the_fork_server() -> None:
+    stages = StageProcesses(1)
+    server = fork_server._helpers()[0]  # pyright: ignore[reportPrivateUsage]
+    assert server is not None
+    os.kill(server, signal.SIGSTOP)
+    threading.Timer(0.5, stages.give_up).start()
+    begin = time.monotonic()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            stages.spawn("one", _body)
+        assert time.monotonic() - begin < fork_server.SILENT_S  # before the watcher of the start does anything
+        with pytest.raises(KeyboardInterrupt):
+            stages.spawn("two", _body)
+    finally:
+        stages.close(set())
