@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route, Router
 from starlette.types import ASGIApp
@@ -239,11 +239,14 @@ async def _object(request: Request) -> dict[str, Any]:
     if not request.headers.get("content-type", "").startswith("application/json"):
         raise StereoSfmError("send the header Content-Type: application/json")
     data = b""
-    async with asyncio.timeout(HANDSHAKE_S):
-        async for part in request.stream():
-            data += part
-            if len(data) > BODY_BYTES:
-                raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
+    try:
+        async with asyncio.timeout(HANDSHAKE_S):
+            async for part in request.stream():
+                data += part
+                if len(data) > BODY_BYTES:
+                    raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
+    except ClientDisconnect:
+        raise StereoSfmError("the connection was closed before the end of the body") from None
     try:
         values = json.loads(data)
     except (ValueError, RecursionError):
