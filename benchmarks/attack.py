@@ -306,9 +306,10 @@ def many_saves(t: Target) -> Outcome:
 
 
 def group_signal(t: Target) -> Outcome:
-    """SIGTERM to the whole process group while another service starts"""
-    slowest, killed = 0.0, 0
-    for delay in (0.5, 1.0, 1.5, 2.0, 3.0):
+    """signals to the whole process group while another service starts"""
+    slowest, wrong = 0.0, list[str]()
+    moments = [(count, number) for count in (1, 3, 6, 9) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)]
+    for count, number in moments:
         with tempfile.TemporaryDirectory(prefix="attack") as name:
             other = Target(Path(name), _free_port(), _free_port(), _free_port(), 0, t.process)
             command = [sys.executable, "-m", "stereo_sfm.cli", "serve", str(DEMO), *_settings(other)]
@@ -316,22 +317,74 @@ def group_signal(t: Target) -> Outcome:
                 command, env=_environment(other.folder), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                 start_new_session=True,
             )  # fmt: skip
-            time.sleep(delay)
-            os.killpg(process.pid, signal.SIGTERM)
+            until = time.monotonic() + START_S
+            while len(_group(process.pid)) <= count and process.poll() is None and time.monotonic() < until:
+                time.sleep(0.01)
             begin = time.monotonic()
-            said = process.communicate(timeout=60)[0]
+            os.killpg(process.pid, number)
+            try:
+                said = process.communicate(timeout=60)[0]
+            except subprocess.TimeoutExpired:
+                wrong.append(f"{number.name} after {count} processes: hangs")
+                os.killpg(process.pid, signal.SIGKILL)
+                said = process.communicate()[0]
             slowest = max(slowest, time.monotonic() - begin)
-            killed += "ended (exit code" in said or "Traceback" in said
+            time.sleep(1.0)  # a process that reads the end of a pipe ends
+            left = len(_group(process.pid))
+            if "ended (exit code" in said or "Traceback" in said or left:
+                wrong.append(f"{number.name} after {count} processes: {left} left, {said.strip()[-80:]}")
     return (
-        f"slowest end {slowest:.1f} s, {killed} with a process killed or a traceback",
-        slowest <= STOP_S and not killed,
+        f"{len(moments)} signals, the slowest end {slowest:.1f} s {'; '.join(wrong)}",
+        slowest <= STOP_S and not wrong,
     )
+
+
+def stopped_processes(t: Target) -> Outcome:
+    """a process of a run is stopped or killed while it starts"""
+    slowest, wrong = 0.0, list[str]()
+    for number in (signal.SIGSTOP, signal.SIGTERM):
+        for k in range(6):
+            with tempfile.TemporaryDirectory(prefix="attack") as name:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "stereo_sfm.cli", "run", str(DEMO), "--speed", "0.5", "-o", f"{name}/run"],
+                    env=_environment(Path(name)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+                    start_new_session=True,
+                )  # fmt: skip
+                until = time.monotonic() + START_S
+                while len(_group(process.pid)) <= k + 3 and process.poll() is None and time.monotonic() < until:
+                    time.sleep(0.01)
+                found = sorted(set(_group(process.pid)) - {process.pid})
+                if k < len(found):
+                    os.kill(found[k], number)
+                time.sleep(2.0)
+                begin = time.monotonic()
+                process.send_signal(signal.SIGTERM)
+                try:
+                    said = process.communicate(timeout=60)[0]
+                except subprocess.TimeoutExpired:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    said = process.communicate()[0] + "hangs: Traceback"
+                slowest = max(slowest, time.monotonic() - begin)
+                if "Traceback" in said:
+                    wrong.append(f"{number.name} of process {k}: {said.strip()[-80:]}")
+    return f"12 processes, the slowest end {slowest:.1f} s {'; '.join(wrong)}", not wrong and slowest <= 2 * STOP_S
+
+
+def _group(leader: int) -> list[int]:
+    """The processes of a group that are not only waited for."""
+    found: list[int] = []
+    for place in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, group = place.read_text().rpartition(")")[2].split()[:3]
+            if int(group) == leader and state != "Z":
+                found.append(int(place.parent.name))
+    return found
 
 
 ATTACKS: tuple[Callable[[Target], Outcome], ...] = (
     foreign_page, without_a_token, a_link_twice, idle_connections, silent_connections, slow_handshakes,
     clients_that_never_read, guesses, hostile_requests, a_map_over_recordings, files_of_others, two_writers,
-    hostile_files, many_saves, group_signal,
+    hostile_files, many_saves, group_signal, stopped_processes,
 )  # fmt: skip
 
 

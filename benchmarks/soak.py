@@ -146,6 +146,7 @@ class Watch:
     segment: int = 0  # bytes of the largest one
     over_quota: float = 0.0
     tracked: bool = False
+    session: int = 0
 
     def pose(self, pose: PoseUpdate) -> None:
         if pose.frame_id > self.frame + 1:
@@ -159,6 +160,11 @@ class Watch:
         self.untracked += not pose.tracked
         if pose.frame_id < self.by_clock:
             self.arrived.extend((pose.captured_s, time.monotonic()))
+
+    def start(self, started: Started) -> None:
+        if started.session > self.session:  # else it tells how the camera is mounted
+            self.session = started.session
+            self.sessions.append(self.frame + 1)
 
     def status(self, status: Status) -> None:
         if not self.states or self.states[-1][1] != status.state:
@@ -295,7 +301,7 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
         service.on(PoseUpdate, watch.pose)
         service.on(Status, watch.status)
         service.on(HealthReport, lambda report: watch.report(report, service.pids))
-        service.on(Started, lambda started: watch.sessions.append(watch.frame + 1))
+        service.on(Started, watch.start)
         observing = threading.Thread(target=observe, args=(service, work / "recordings", watch, count), daemon=True)
         observing.start()
         for frame, fault in events:

@@ -66,7 +66,7 @@ def _configuration() -> str:
 
 
 def _sources() -> str:
-    from stereo_sfm.drivers.options import described
+    from stereo_sfm.drivers.options import grouped
     from stereo_sfm.drivers.registry import drivers
 
     found = dict(drivers())
@@ -74,11 +74,14 @@ def _sources() -> str:
     parts = ["| kind | what it reads | written as |", "|---|---|---|", *rows, ""]
     for kind, one in found.items():
         parts += [f"## {kind}", "", f"{one.summary[:1].upper()}{one.summary[1:]}.", ""]
-        parts += ["| option | default | meaning |", "|---|---|---|"]
-        for option in described(one.options):
-            default = f"`{option.default}`" if option.default else ""
-            parts.append(f"| `{option.name}` | {default} | {option.doc}{': ' * bool(option.wanted)}{option.wanted} |")
-        parts.append("")
+        for title, helps in grouped(one.options):
+            parts += [f"**{title[:1].upper()}{title[1:]}**", ""] if title else []
+            parts += ["| option | default | meaning |", "|---|---|---|"]
+            for option in helps:
+                default = f"`{option.default}`" if option.default else ""
+                meaning = f"{option.doc}{': ' * bool(option.wanted)}{option.wanted}"
+                parts.append(f"| `{option.name}` | {default} | {meaning} |")
+            parts.append("")
     return "\n".join(parts)
 
 

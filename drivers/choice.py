@@ -199,9 +199,11 @@ def with_start_check(opener: Opener, correct: bool) -> Opener:
     return replace(opener, start="corrected" if correct else "checked")
 
 
-def with_known_start(opener: Opener, check: StartCheck) -> Opener:
-    """The opener of a source whose first images were looked at before."""
-    return replace(opener, start_check=check) if isinstance(opener, SourceChoice) else opener
+def with_known_start(opener: Opener, check: StartCheck | None) -> Opener:
+    """The opener of a source whose first images were looked at before. Args: check, what they said; None: they fit."""
+    if not isinstance(opener, SourceChoice) or isinstance(opener, ReplayChoice):
+        return opener
+    return replace(opener, start="unchecked", start_check=check)
 
 
 def _loaded(rig: RigOption) -> Rig | None:

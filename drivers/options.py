@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from stereo_sfm.errors import StereoSfmError, did_you_mean
 
@@ -55,7 +55,12 @@ def option(
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options of every driver; a driver's own options inherit from it."""
+    """Options of every driver; a driver's own options inherit from it.
+
+    `GROUPS`: title -> names of the options listed under it; those of no group are listed first.
+    """
+
+    GROUPS: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
     rig: RigOption = option(None, "calibration instead of the source's own: a file of any format", read=lambda x: x)  # noqa: RUF009
 
@@ -91,6 +96,14 @@ class OptionHelp:
     default: str
     wanted: str
     doc: str
+
+
+def grouped(cls: type[SourceOptions]) -> Iterator[tuple[str, list[OptionHelp]]]:
+    """(title, options) of each group of a driver's options; the title of those of no group is empty."""
+    of = {name: title for title, names in cls.GROUPS.items() for name in names}
+    found = list(described(cls))
+    for title in ("", *cls.GROUPS):
+        yield title, [one for one in found if of.get(one.name, "") == title]
 
 
 def described(cls: type[SourceOptions]) -> Iterator[OptionHelp]:

@@ -20,7 +20,7 @@ def main(frames: int = 40) -> None:
         s.export_map(system.saved_map(), place / "colmap", "colmap")
         s.export_map(system.saved_map(), place / "points.ply", "ply")
         s.export_trajectory(system.trajectory(), place / "trajectory.tum", "tum")
-    print("written:", ", ".join(sorted(path.name for path in place.iterdir())))
+    print("written:", ", ".join(str(path) for path in sorted(place.iterdir())))
 
 
 if __name__ == "__main__":

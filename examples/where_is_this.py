@@ -21,6 +21,7 @@ def main(frames: int = 60) -> None:
         for image in images:
             system.step(image.left, image.right, image.stamp_ns)
     system.save_map(place)
+    print(f"map: {place}")
 
     asked = images[len(images) // 2]
     answer = s.MapLocator(place).locate(asked.left, asked.right)

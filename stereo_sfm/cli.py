@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import importlib
 import io
 import logging
@@ -151,7 +152,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.print_help()
             return 0
         command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
-        return command.run(options)
+        code = command.run(options)
+        if argv is None and options.command == "serve":
+            _leave(code)
+        return code
     except StereoSfmError as error:
         print(f"stereo-sfm {options.command}: {error}", file=sys.stderr)
         return error.exit_code
@@ -169,6 +173,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _leave(code: int) -> None:
+    """End a process whose work is written: the interpreter would take seconds on a busy computer to free its memory."""
+    atexit._run_exitfuncs()  # pyright: ignore[reportPrivateUsage]
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 if __name__ == "__main__":

@@ -98,7 +98,6 @@ class SaveMap:
     """A request: write the session's part of the map."""
 
     folder: Path  # replaced
-    urgent: bool = False  # the run is ending: at the priority of the stage, not below it
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import runpy
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 SAID = {
-    "export.py": "written: colmap, points.ply, trajectory.tum",
+    "export.py": "{folder}/colmap, {folder}/points.ply, {folder}/trajectory.tum",
     "odometry_only.py": "OK: [",
     "own_loop.py": "keyframes\npath of 0.",
     "where_is_this.py": "mm from its pose",
@@ -22,4 +25,20 @@ def test_an_example_runs_and_prints_its_output(
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     runpy.run_path(str(path))["main"](12)
-    assert SAID[path.name] in capsys.readouterr().out
+    said = capsys.readouterr().out
+    (folder,) = list(tmp_path.iterdir()) or [None]
+    assert SAID[path.name].format(folder=folder) in said
+    assert folder is None or str(folder) in said
+
+
+def test_a_client_without_a_service_ends_with_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, str(EXAMPLES[0].parent / "pose_client" / "client.py")]
+    place = tmp_path / "poses"
+    ended = subprocess.run([*command, str(place)], capture_output=True, text=True, check=False)
+    assert ended.returncode == 1 and ended.stderr == f"no service at {place}: No such file or directory\n"
+    with socket.socket(socket.AF_UNIX) as server:  # one that refuses the token
+        server.bind(str(place))
+        server.listen()
+        client = subprocess.Popen([*command, str(place)], stderr=subprocess.PIPE, text=True)
+        server.accept()[0].close()
+        assert len(client.communicate()[1].splitlines()) == 1 and client.returncode == 1

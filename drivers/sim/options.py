@@ -36,6 +36,25 @@ def _interval(value: Any) -> tuple[float, float]:
 class SimOptions(SourceOptions):
     """Options of `sim:SCENE`."""
 
+    GROUPS = {  # noqa: RUF012
+        "store": (
+            "seed", "walk", "exchange", "nights", "fill", "gaps", "setback", "round", "hanging", "glossy", "clear",
+            "glass", "bare", "polish", "carts", "people", "encounters", "flicker", "dark",
+        ),
+        "drive": (
+            "length", "path", "returns", "speed", "corner", "spot_turns", "thresholds", "ramps", "pushed", "rest",
+            "vibration", "robot",
+        ),
+        "camera": (
+            "camera", "size", "rate", "noise", "blur", "shutter", "rays", "dirt", "jpeg", "residual", "decentered",
+            "tilted", "rows", "right_exposure", "right_blur", "stamp_jitter_ms", "stamped", "readout", "drop",
+            "effects",
+        ),
+        "IMU and wheels": (
+            "imu", "imu_offset_ms", "wheel", "wheel_grade", "wheel_slip", "wheel_offset_ms",
+        ),
+    }  # fmt: skip
+
     camera: Literal["fisheye", "pinhole", "distorted"] = option("fisheye", "lenses of the simulated pair")
     size: tuple[int, int] | None = option(None, "WIDTHxHEIGHT, scales the images", read=_size)
     seed: int = option(0, "seed of products, sensor noise and people", low=0, high=2**31)

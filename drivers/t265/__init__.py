@@ -23,9 +23,14 @@ def _from_python(value: Any) -> Any:
     return value
 
 
+_OF_THE_SIMULATED = ("images", "frames", "faults", "paced", "seed")
+
+
 @dataclass(frozen=True)
 class T265Options(SourceOptions):
-    """Options of `t265`, `t265:SERIAL` and `t265:simulated`; the last five are the simulated camera's."""
+    """Options of `t265`, `t265:SERIAL` and `t265:simulated`."""
+
+    GROUPS = {f"only of t265:{SIMULATED}": _OF_THE_SIMULATED}  # noqa: RUF012
 
     exposure: int | None = option(
         None, "microseconds; auto: by the camera", low=m.MIN_EXPOSURE_US, high=m.MAX_EXPOSURE_US
@@ -44,9 +49,6 @@ class T265Options(SourceOptions):
     faults: str = option("none", "names of stereo_sfm.drivers.t265.simulated.faults.PRESETS, separated by commas")
     paced: bool = option(True, "real time; off: as fast as the host reads")
     seed: int = option(0, "of the simulated room", low=0, high=2**31)
-
-
-_OF_THE_SIMULATED = ("images", "frames", "faults", "paced", "seed")
 
 
 def _open(place: str, options: T265Options) -> Source:

@@ -12,8 +12,15 @@ try:
     connection.connect(("127.0.0.1", int(place)) if place.isdigit() else place)
 except OSError as error:
     sys.exit(f"no service at {place}: {error.strerror}")
-if token.exists():
-    connection.sendall(token.read_bytes())
-for line in connection.makefile():
-    pose = json.loads(line)
-    print(pose["unix_ns"], pose["state"], *(f"{v:.3f}" for v in pose["map_position"]), f"{pose['latency_ms']:.1f} ms")
+try:
+    if token.exists():
+        connection.sendall(token.read_bytes())
+    for line in connection.makefile():
+        pose = json.loads(line)
+        where = (f"{v:.3f}" for v in pose["map_position"])
+        print(pose["unix_ns"], pose["state"], *where, f"{pose['latency_ms']:.1f} ms")
+except OSError as error:
+    sys.exit(f"the service at {place} has closed the connection: {error.strerror}")
+except KeyboardInterrupt:
+    sys.exit(130)
+sys.exit(f"the service at {place} has closed the connection: it has ended, or the token in {token} is not its own")

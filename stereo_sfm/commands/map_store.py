@@ -159,10 +159,10 @@ def _label(options: LabelOptions) -> int:
     import dataclasses
 
     from stereo_sfm.maps.labels import Aisle, Door
-    from stereo_sfm.maps.store import lock, read_about, write_about
+    from stereo_sfm.maps.store import lock_about, read_about, write_about
 
     _check_store(options.store)
-    with lock(options.store):
+    with lock_about(options.store):
         about = read_about(options.store)
         aisles = tuple(a for a in about.aisles if a.name != options.name)
         doors = tuple(d for d in about.doors if d.name != options.name)
@@ -187,12 +187,11 @@ def _plan(store: Path, resolution: float) -> int:
     from stereo_sfm.export.floor_plan import make_floor_plan, write_floor_plan
     from stereo_sfm.export.keep_out import read_zones, write_zones
     from stereo_sfm.export.shelf_fronts import shelf_fronts
-    from stereo_sfm.maps.saved_map import load_map
-    from stereo_sfm.maps.store import lock, read_about, write_about
+    from stereo_sfm.maps.store import load_current, lock_about, read_about, write_about
 
     _check_store(store)
-    with lock(store):
-        saved = load_map(store)
+    with lock_about(store):
+        saved = load_current(store)
         about = read_about(store, saved)
         write_about(store, about)  # the frame of the drawing
         plan = make_floor_plan(saved.snapshot, resolution, about.map_T_floor)

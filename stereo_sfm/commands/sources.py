@@ -19,12 +19,14 @@ def run(args: argparse.Namespace) -> int:
         rows = [(f"{kind}:{found.place}", found.summary) for kind, found in drivers()]
         print("\n".join(_table(("source", "what it reads"), rows)))
         return 0
-    from stereo_sfm.drivers.options import described
+    from stereo_sfm.drivers.options import grouped
 
     found = driver(one_of(args.kind, kinds(), "source"))
-    print(f"{args.kind}:{found.place}?OPTION=VALUE&...: {found.summary}\n")
-    rows = [(h.name, h.default or "-", ": ".join(filter(None, (h.doc, h.wanted)))) for h in described(found.options)]
-    print("\n".join(_table(("option", "default", "meaning"), rows)))
+    print(f"{args.kind}:{found.place}?OPTION=VALUE&...: {found.summary}")
+    for title, helps in grouped(found.options):
+        rows = [(h.name, h.default or "-", ": ".join(filter(None, (h.doc, h.wanted)))) for h in helps]
+        print(f"\n{title}" if title else "")
+        print("\n".join(_table(("option", "default", "meaning"), rows)))
     return 0
 
 

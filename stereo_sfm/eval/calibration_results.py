@@ -12,6 +12,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.calib.wheel_fit import NAMES as WHEEL_NAMES
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.maps.mounting import Mounting, mounted
 from stereo_sfm.types import CalibrationUpdate, SensorUpdate
 
 CORRECTED = "rig_corrected.yaml"
@@ -74,6 +75,14 @@ def _sensor_terms(update: SensorUpdate) -> list[tuple[str, float, float, str]]:
     ]
 
 
+def mounting_stats(mounting: Mounting | None) -> dict[str, Any] | None:
+    """The camera's tilt on a robot; None where it is given, felt by an IMU, or not measured."""
+    if mounting is None:
+        return None
+    names = "pitch_deg", "roll_deg", "pitch_sigma_deg", "roll_sigma_deg"
+    return {"text": mounting.text, **{name: getattr(mounting, name) for name in names}}
+
+
 def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
     """The last row errors and the largest; None without two cameras."""
     last = record.row_errors
@@ -90,9 +99,11 @@ def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
 
 
 def calibration_lines(stats: dict[str, Any]) -> list[str]:
-    """A line about the start check, one for each change of the calibration, and one about the row errors."""
+    """Lines about the start check, the tilt, the row errors, and one for each change of the calibration."""
     rows, checked = stats["row_errors"], stats["start_check"]
     begun = [f"calibration at the start: {checked['text']}"] if checked and checked["shown"] else []
+    tilt = stats["mounting"]
+    begun += [f"{tilt['text']}: {CORRECTED} has it as body_T_left"] if tilt else []
     off = [] if rows is None else [f"row error {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
     if rows is not None and rows["warning"]:
         off[0] += ": the calibration does not fit (see check-calib)"
@@ -112,19 +123,22 @@ def calibration_lines(stats: dict[str, Any]) -> list[str]:
     return lines + [f"sensors compared with the images at {c['seconds']:.1f} s: {c['text']}" for c in compared]
 
 
-def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
-    """`rig_corrected.yaml` of the last changes, their terms and covariance in comments; nothing without one."""
+def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord, mounting: Mounting | None = None) -> None:
+    """`rig_corrected.yaml` of the last changes, their terms and covariance in comments; nothing without one.
+
+    Args: mounting, of the camera on the robot, where it was measured.
+    """
     from stereo_sfm.calib import save_rig
 
     sensors = record.sensor_updates[-1] if record.sensor_updates else None
     changed = sensors is not None and bool(sensors.imu.any() or sensors.wheel.any())
-    if not record.calibrations and not changed:
+    if not record.calibrations and not changed and mounting is None:
         return
     path = folder / CORRECTED
     corrected = rig if sensors is None else with_sensor_terms(rig, sensors)
     if record.calibrations:
         corrected = with_terms(corrected, record.calibrations[-1].terms)
-    save_rig(corrected, path)
+    save_rig(corrected if mounting is None else mounted(corrected, mounting), path)
     lines = _camera_comments(record.calibrations[-1]) if record.calibrations else []
     if sensors is not None:
         lines += [
@@ -136,6 +150,8 @@ def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
             for name, value, sigma, unit in _sensor_terms(sensors)
             if np.isfinite(sigma)
         ]
+    if mounting is not None:
+        lines += ["", f"# body_T_left was measured while driving: {mounting.text}"]
     path.write_text(path.read_text("utf-8").rstrip() + "\n".join(lines) + "\n", encoding="utf-8")
 
 

@@ -17,6 +17,7 @@ from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
+from stereo_sfm.maps.mounting import MountingEstimate
 from stereo_sfm.messages import Health, LogEnded, LogLine, SourceCounters, StageTimes
 from stereo_sfm.recording.describe import GAP
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
@@ -114,6 +115,7 @@ class RunRecord:
     sensor_news: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # stamp_ns, why one is left out
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     located_kf_id: int = -1  # first keyframe that was found in the saved map
+    mounting: MountingEstimate = field(default_factory=MountingEstimate)  # the camera's tilt, if it is on a robot
     _path_m: float = 0.0
 
     @staticmethod
@@ -154,6 +156,7 @@ class RunRecord:
         )
         self.down_information += keyframe.down_sigma**-2 if keyframe.down_sigma > 0 else 0.0
         self._see(keyframe.point_ids)
+        self.mounting.add(keyframe)
 
     @_take.register
     def _put_stage_times(self, times: StageTimes) -> None:

@@ -21,6 +21,7 @@ from stereo_sfm.eval.statistics import MAX_LOST_PERCENT, statistics
 from stereo_sfm.export.run_folder import write_json
 from stereo_sfm.export.trajectories import write_kitti, write_tum
 from stereo_sfm.geometry import se3
+from stereo_sfm.maps.mounting import unknown
 from stereo_sfm.types import F64, Trajectory
 
 log = logging.getLogger("stereo_sfm")
@@ -69,6 +70,8 @@ def write_results(
     mapped = record.mapped() if config.mapper.enabled or config.loop.enabled else None
     if mapped is not None:
         estimates["map"] = mapped
+    mounting = record.mounting.result() if unknown(rig) else None
+    mounting = mounting if mounting is not None and mounting.measured else None
     with writing_to(folder):
         for short, trajectory in zip(("odom", "map"), estimates.values(), strict=False):
             _write_trajectory(folder, short, trajectory, record, rig, frame, step)
@@ -77,9 +80,9 @@ def write_results(
             _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
         (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8")
         save_rig(rig, folder / "rig.yaml")
-        write_corrected_rig(folder, rig, record)
+        write_corrected_rig(folder, rig, record, mounting)
         evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
-        stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
+        stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations, mounting)}
         stats["max_lost_percent"] = max_lost_percent
         write_json(folder / "stats.json", stats)
         write_report(folder, source_name, record, stats, estimates, reference, evaluations, go_on)

@@ -12,6 +12,7 @@ from stereo_sfm.drivers.live.counters import LOSSES
 from stereo_sfm.eval.calibration_results import (
     calibration_lines,
     calibration_stats,
+    mounting_stats,
     row_error_stats,
     sensor_stats,
     start_check_stats,
@@ -19,6 +20,7 @@ from stereo_sfm.eval.calibration_results import (
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.sensor_results import sensor_lines, sensor_use_stats
+from stereo_sfm.maps.mounting import Mounting
 from stereo_sfm.messages import Health
 from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
 from stereo_sfm.types import F64, TrackState
@@ -43,7 +45,12 @@ def stage_times(record: RunRecord) -> dict[str, dict[str, float]]:
     return {stage: {**percentiles(ran[stage]), "frames": float(len(ran[stage]))} for stage in order}
 
 
-def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluation] | None = None) -> dict[str, Any]:
+def statistics(
+    record: RunRecord,
+    wall_s: float,
+    evaluations: dict[str, Evaluation] | None = None,
+    mounting: Mounting | None = None,
+) -> dict[str, Any]:
     """The numbers of a run as plain values for JSON."""
     tracked = int(record.tracked().sum())
     frames, drops = len(record.frames), record.drops
@@ -74,6 +81,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "path_m": trajectory.length if len(trajectory) > 1 else 0.0,
         "duration_s": float(stamps[-1] - stamps[0]) / 1e9 if frames else 0.0,
         "gravity": gravity_stats(record),
+        "mounting": mounting_stats(mounting),
         "loops_accepted": len(record.loops),
         "loops_rejected": dict(sorted(record.rejected.items(), key=lambda item: (-item[1], item[0]))),
         "loop_errors_at": record.failed_kf_ids,  # keyframes at which the loop closer failed

@@ -48,10 +48,7 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
     depth = points[candidates] @ down
     if len(depth) < 20:
         return down, float(np.percentile(points @ down, 99)) if len(points) else 1.5
-    counts, edges = np.histogram(depth, np.arange(depth.min(), depth.max() + 0.1, 0.05))
-    smooth = np.convolve(counts, [1, 2, 1], "same")
-    full = np.flatnonzero(smooth > 0.4 * smooth.max())
-    level = float(edges[full[-1]] + 0.025)
+    level = floor_level(depth)
     near, normal = points[candidates][np.abs(depth - level) < 0.08], down
     for _ in range(5):
         mean = near.mean(0)
@@ -64,3 +61,11 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
         if len(near) < 20:
             return down, level
     return normal, float(near.mean(0) @ normal)
+
+
+def floor_level(depth: F64) -> float:
+    """Metres to the lowest well-filled level. Args: depth, (N,) metres of points below the camera."""
+    counts, edges = np.histogram(depth, np.arange(depth.min(), depth.max() + 0.1, 0.05))
+    smooth = np.convolve(counts, [1, 2, 1], "same")
+    full = np.flatnonzero(smooth > 0.4 * smooth.max())
+    return float(edges[full[-1]] + 0.025)

@@ -34,7 +34,7 @@ def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
             _sync(folder)
             _take_complete(folder)
         else:
-            _swap(draft, folder)
+            _swap(draft, folder, names)
         _sync(folder.parent)
     finally:
         _remove(draft)
@@ -80,7 +80,8 @@ def _cannot_move(folder: Path) -> bool:
     return folder.is_mount() or folder == here or folder in here.parents
 
 
-def _swap(draft: Path, folder: Path) -> None:
+def _swap(draft: Path, folder: Path, names: frozenset[str]) -> None:
+    """Other files than `names`, which somebody has written into the old folder meanwhile, move into the new one."""
     if not folder.exists():
         draft.rename(folder)
         return
@@ -92,6 +93,8 @@ def _swap(draft: Path, folder: Path) -> None:
     except OSError:
         old.rename(folder)
         raise
+    for path in [path for path in old.iterdir() if path.name not in names]:
+        path.rename(folder / path.name)
     _remove(old)
 
 

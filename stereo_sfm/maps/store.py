@@ -57,6 +57,41 @@ def lock(store: Path) -> FolderLock:
     return FolderLock(folder, f"wait until the map {store} is written, or stop the service that extends it")
 
 
+def lock_about(store: Path) -> FolderLock:
+    """Lock what people wrote about a store, which a running service leaves as it is.
+
+    Raises:
+        StereoSfmError: another process writes it.
+    """
+    folder = versions_folder(store) / "about"
+    folder.mkdir(parents=True, exist_ok=True)
+    return FolderLock(folder, f"labels or plans of {store} are being written: try again")
+
+
+def load_current(store: Path) -> SavedMap:
+    """The map of a store; one that a running service replaces meanwhile is read again.
+
+    Raises:
+        StereoSfmError: as `load_map`.
+    """
+    while True:
+        before = _written(store)
+        try:
+            return load_map(store)
+        except StereoSfmError:
+            if _written(store) == before:
+                raise
+
+
+def _written(store: Path) -> tuple[int, int] | None:
+    """Tells one complete map of a store from the next; None while there is none."""
+    try:
+        found = (store / "map.json").stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
 def lock_versioned(folder: Path) -> AbstractContextManager[object]:
     """The same of a map folder that is a store; any other is not locked.
 
@@ -74,7 +109,7 @@ def read_about(store: Path, saved: SavedMap | None = None) -> About:
     """
     path = store / ABOUT
     if not path.is_file():
-        return About(0, find_floor((saved or load_map(store)).snapshot))
+        return About(0, find_floor((saved or load_current(store)).snapshot))
     try:
         data: Any = yaml.safe_load(read_text(path, MOST_ABOUT))
         aisles = tuple(Aisle(*_line(line)) for line in data["aisles"])
@@ -112,6 +147,11 @@ def write_version(store: Path, saved: SavedMap, changes: list[str], keep: int = 
     Returns:
         The number of the version.
     """
+    with lock_about(store):
+        return _write_version(store, saved, changes, keep)
+
+
+def _write_version(store: Path, saved: SavedMap, changes: list[str], keep: int) -> int:
     exists = (store / "map.json").exists()
     about = read_about(store) if exists else About(0, find_floor(saved.snapshot))
     if exists:

@@ -48,6 +48,15 @@ class Setup:
     folders: MapFolders
     delays: int | None  # seed of random delays in every stage (tests)
     opening: Opening = field(default_factory=Opening)  # of the source
+    pose_first: bool = False  # the first pose waits for the code of the first image only
+
+
+@dataclass(frozen=True, eq=False)
+class WarmUp:
+    """A request before the set-up: load the code for images of such a rig."""
+
+    config: Config
+    rig: Rig
 
 
 class Report(Outbox):
@@ -95,8 +104,13 @@ class Ready:
     stage: str
 
 
-def ready(stage: str, setup: Setup, to_main: Outbox, then: Callable[[], None] = lambda: None) -> None:
-    """Load the stage's code and send `Ready`; one helps the tracker first. Args: then, called between the two."""
+def ready(
+    stage: str, setup: Setup, to_main: Outbox, then: Callable[[], None] = lambda: None, warm: bool = False
+) -> None:
+    """Load the stage's code and send `Ready`; one helps the tracker first.
+
+    Args: then, called between the two. warm: its code is loaded.
+    """
     from stereo_sfm.kernel_cache import listening
     from stereo_sfm.pipeline.first_kernels import help_tracker
     from stereo_sfm.pipeline.warm_up import warm_up_stage
@@ -104,7 +118,8 @@ def ready(stage: str, setup: Setup, to_main: Outbox, then: Callable[[], None] = 
     with listening(lambda kernel: to_main.send(Compiling(stage, kernel))):
         if stage == HELPER:
             help_tracker(setup.config, setup.rig)
-        warm_up_stage(stage, setup.config, setup.rig, patient=not setup.realtime)
+        if not warm:
+            warm_up_stage(stage, setup.config, setup.rig, patient=not setup.realtime or setup.pose_first)
     then()
     to_main.send(Ready(stage))
 

@@ -1,8 +1,10 @@
-"""Saves the map during the run: the mapper takes a copy between two keyframes, a thread writes it."""
+"""Saves the map during the run: the mapper takes a copy between two keyframes, a thread writes it.
+
+The thread has the mapper's priority: one of low priority would hold the interpreter while others are served.
+"""
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
@@ -16,8 +18,6 @@ from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.messages import MapSaved, Relocalize, SaveMap
 from stereo_sfm.pipeline.channels import End, Inbox
 from stereo_sfm.types import Keyframe, LoopResult
-
-NICE = 10  # of the thread that writes, where the system has priorities of threads
 
 
 class MapSaver:
@@ -42,7 +42,7 @@ class MapSaver:
     def finish(self, folder: Path | None) -> None:
         """After the last keyframe: save what changed since the last request, and wait until everything is written."""
         if folder is not None and self.changed:
-            self._save(SaveMap(folder, urgent=True))
+            self._save(SaveMap(folder))
         self._join()
 
     def _join(self) -> None:
@@ -74,9 +74,6 @@ class MapSaver:
         from stereo_sfm.maps.unfinished import save_session
 
         folder = request.folder
-        if hasattr(os, "setpriority") and not request.urgent:
-            thread = threading.get_native_id()
-            os.setpriority(os.PRIO_PROCESS, thread, max(os.getpriority(os.PRIO_PROCESS, thread), NICE))
         try:
             save_session(saved, place, folder)
         except (StereoSfmError, OSError) as error:

@@ -16,6 +16,7 @@ MODULES = (
     "stereo_sfm.loop.closer",
     "stereo_sfm.mapping.mapper",
     "stereo_sfm.maps.saved_map",
+    "stereo_sfm.maps.unfinished",
     "stereo_sfm.pipeline.capture",
     "stereo_sfm.pipeline.logger",
     "stereo_sfm.pipeline.map_saver",

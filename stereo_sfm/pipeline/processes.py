@@ -28,6 +28,7 @@ from stereo_sfm.pipeline.logger_link import BACKLOG
 from stereo_sfm.pipeline.loop_link import LoopLink
 from stereo_sfm.pipeline.stage_graph import OuterEnds, start_stages
 from stereo_sfm.pipeline.stage_processes import MIN_OPEN_FILES, StageProcesses, raise_file_limit
+from stereo_sfm.pipeline.standby import Standby
 from stereo_sfm.pipeline.text import Listener, emit
 from stereo_sfm.pipeline.viewer import ViewerOptions
 from stereo_sfm.pipeline.watchdog import Heartbeat, Watchdog
@@ -68,6 +69,7 @@ class ProcessRun:
         images: Callable[[SlotImage], None] | None = None,
         silent_s: float | None = None,
         pose_first: bool = False,
+        standby: Callable[[], Standby | None] = lambda: None,
     ) -> None:
         """Prepare a run.
 
@@ -85,12 +87,14 @@ class ProcessRun:
             images: takes each image in place of a log, and calls `release` when it was read.
             silent_s: a stage that does not respond for so long ends the run; None: it is only reported.
             pose_first: begin with a live camera's images as soon as there are poses; the map follows.
+            standby: called at the start: whose processes are used, without log and viewer only; None: none wait.
         """
         self._opener, self._config, self._sinks = opener, config, list(sinks)
         self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
         self._folders, self._viewer = folders or MapFolders(), viewer
         self._opened, self._images, self._silent_s = opened, images, silent_s
         self._pose_first = pose_first
+        self._take_standby = standby
         self._stages = StageProcesses(config.pipeline.threads)
         self._outer = OuterEnds()
         self._setup: Setup
@@ -155,6 +159,8 @@ class ProcessRun:
             self._stages.resume(stage)
         if self._set_up_sent:
             self._stages.request("capture", "stop")
+        else:
+            self._stages.give_up()
         with contextlib.suppress(OSError):  # the whole run has ended
             self._wake.send("stop")
 
@@ -261,7 +267,12 @@ class ProcessRun:
     # -- start -------------------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        self._outer = start_stages(self._stages, self._opener, self._log, self._viewer)
+        standby = self._take_standby()
+        if standby is None:
+            self._outer = start_stages(self._stages, self._opener, self._log, self._viewer)
+        else:
+            self._stages, self._outer = standby.stages, standby.outer
+            self._stages.request("capture", self._opener)
         self._watchdog = Watchdog(self.pids, log.warning, self._silent_s)
         info = self._first_report()
         self._live = info.live if self._realtime is None else self._realtime
@@ -289,6 +300,7 @@ class ProcessRun:
             folders=self._folders,
             delays=self._delays,
             opening=self._folders.opening(self._opener.opening(info.rig)),
+            pose_first=self._pose_first,
         )
         self._loop.closing = self._config.closes_loops(info.rig.stereo, self._folders.localize_only)
         self._setup = setup
@@ -423,7 +435,7 @@ class ProcessRun:
         Args: folder, replaced. urgent: the run is about to be stopped, which then waits for it up to `SAVE_END_S`.
         """
         self._saving_at_end |= urgent
-        self._request("mapper", SaveMap(folder, urgent))
+        self._request("mapper", SaveMap(folder))
 
     def has_ended(self, stage: str) -> bool:
         """Whether a stage came to its end by itself."""

@@ -45,9 +45,9 @@ class OuterEnds:
 
 
 def start_stages(
-    stages: StageProcesses, opener: Opener, log: LogOptions | None, viewer_options: ViewerOptions | None
+    stages: StageProcesses, opener: Opener | None, log: LogOptions | None, viewer_options: ViewerOptions | None
 ) -> OuterEnds:
-    """Start the processes of a run with the pipes between them."""
+    """Start the processes of a run with the pipes between them. Args: opener, of the source; None: it is sent later."""
     pipe, spawn = stages.pipe, stages.spawn
     images, updates = pipe(), pipe()
     to_mapper, loops = pipe(), pipe()

@@ -14,12 +14,15 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline import child
-from stereo_sfm.pipeline.fork_server import start_context
+from stereo_sfm.pipeline.channels import Outbox
+from stereo_sfm.pipeline.fork_server import kill_fork_server, resume_helpers, start_context, watched_start
 from stereo_sfm.pipeline.interrupts import ignored_by_children
 from stereo_sfm.pipeline.threads import thread_environment
 
 EXIT_S = 1.0  # time for the processes to exit after their last messages
+ATTEMPTS, ATTEMPT_S = 5, 0.2  # to start a stage: a fork server that was killed takes a moment to be gone
 MIN_OPEN_FILES = 128  # per process
+ANY_NUMBER = 0  # of requests that wait: main never waits for a stage that does not read them
 
 
 class StageProcesses:
@@ -35,7 +38,8 @@ class StageProcesses:
         self._context, self._threads = start_context(threads), threads
         self.processes: dict[str, BaseProcess] = {}
         self.reports: dict[Connection, str] = {}
-        self._controls: dict[str, Connection] = {}
+        self._controls: dict[str, Outbox] = {}
+        self._starting = self._given_up = False
 
     def pipe(self) -> tuple[Connection, Connection]:
         """(receiving end, sending end)."""
@@ -46,17 +50,42 @@ class StageProcesses:
         report, to_main = self.pipe()
         if stage in self._controls:  # of a process that has ended
             self._controls[stage].close()
-        control, self._controls[stage] = self.pipe()
+        control, requests = self.pipe()
+        self._controls[stage] = Outbox(requests, ANY_NUMBER)
         process = self._context.Process(
             target=child.guarded, args=(stage, body, to_main, control, *arguments), name=f"stereo-sfm {stage}",
             daemon=True,
         )  # fmt: skip
-        with ignored_by_children(), thread_environment(self._threads):
-            process.start()
+        with ignored_by_children(), thread_environment(self._threads), watched_start():
+            self._start(process)
         to_main.close()
         control.close()
         self.processes[stage] = process
         self.reports[report] = stage
+
+    def _start(self, process: BaseProcess) -> None:
+        """Raises:
+        StereoSfmError: the fork server was killed, and so were those after it.
+        KeyboardInterrupt: `give_up` was called.
+        """
+        self._starting = True
+        try:
+            for _ in range(ATTEMPTS):
+                if self._given_up:
+                    raise KeyboardInterrupt
+                with contextlib.suppress(EOFError, ConnectionError):
+                    process.start()
+                    return
+                time.sleep(ATTEMPT_S)
+        finally:
+            self._starting = False
+        raise StereoSfmError("the process that starts the stages was killed again and again")
+
+    def give_up(self) -> None:
+        """Start no more stages, and wait no longer for the fork server, which may still load its code."""
+        self._given_up = True
+        if self._starting:
+            kill_fork_server()
 
     @property
     def pids(self) -> dict[str, int]:
@@ -74,8 +103,9 @@ class StageProcesses:
 
     def request(self, stage: str, message: object) -> None:
         """Send a stage a request; nothing where it has ended: its report gives the reason."""
-        with contextlib.suppress(OSError, KeyError):
-            self._controls[stage].send(message)
+        control = self._controls.get(stage)
+        if control is not None:
+            control.send(message)
 
     def forget(self, stage: str) -> None:
         """Receive no more messages of a stage."""
@@ -111,16 +141,17 @@ class StageProcesses:
 
     def close(self, ended: Set[str]) -> None:
         """End every process and close the pipes. Args: ended, stages that are about to exit by themselves."""
+        resume_helpers()  # which tell of the end of each
         try:
             until = time.monotonic() + EXIT_S
             for stage in ended & self.processes.keys():
                 self.processes[stage].join(max(until - time.monotonic(), 0.0))
             self.kill()
             for process in self.processes.values():
-                process.join()
+                process.join(EXIT_S)
         finally:
-            for connection in (*self.reports, *self._controls.values()):
-                connection.close()
+            for end in (*self.reports, *self._controls.values()):
+                end.close()
             self.reports.clear()
 
 

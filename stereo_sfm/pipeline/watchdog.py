@@ -130,6 +130,11 @@ class Watchdog:
             self._report(f"the {beat.stage} has {what} for {beat.step_s:.0f} s")
 
 
+def process_state(pid: int) -> str:
+    """State of a process as Linux names it, such as `STOPPED`; '' where that is not known."""
+    return _status(pid)[0]
+
+
 def _runnable(pid: int) -> bool:
     """Whether a thread of the process waits for a core: the computer is overloaded, not the process stuck."""
     try:

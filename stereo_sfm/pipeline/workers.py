@@ -12,7 +12,7 @@ from stereo_sfm.maps.folders import make_mapper, save_result
 from stereo_sfm.messages import Localized
 from stereo_sfm.pipeline.allocator import Release, release_memory
 from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox, pickled
-from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
+from stereo_sfm.pipeline.child import Report, Setup, WarmUp, prepare, ready
 from stereo_sfm.pipeline.loop_link import Known
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
@@ -24,14 +24,15 @@ RELEASE_IMAGES = 6000  # after which the tracker does
 def run_capture(
     to_main: Report,
     control: Connection,
-    opener: Opener,
+    opener: Opener | None,
     tracker: Connection,
     readers: tuple[Connection, Connection],
 ) -> None:
-    """Open the source, describe it to main, read it to the end."""
+    """Open the source, describe it to main, read it to the end. Args: opener, of it; None: main sends it."""
     from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 
+    opener = Inbox[Opener](control).take() if opener is None else opener
     with opener() as source:
         to_main.send(SourceInfo.of(source))
         jpeg: bool
@@ -63,6 +64,17 @@ def _schedule(setup: Setup) -> Schedule:
     return Realtime() if setup.realtime else Lockstep(setup.config.pipeline.update_lag_frames)
 
 
+def _warmed_up(control: Inbox[Setup | WarmUp]) -> tuple[Setup, bool]:
+    """The set-up of the tracker, and whether its code was loaded before it came."""
+    warm = False
+    while isinstance(message := control.take(), WarmUp):
+        from stereo_sfm.pipeline.warm_up import warm_up_stage
+
+        warm_up_stage("tracker", message.config, message.rig)
+        warm = True
+    return message, warm
+
+
 def _next_image(inbox: Inbox[Any]) -> Any:
     """If capture was killed, what it read so far is processed."""
     try:
@@ -86,7 +98,7 @@ def run_tracker(
     from stereo_sfm.pipeline.stages import TrackStage, make_tracker_with_places
     from stereo_sfm.timing import Spans
 
-    setup = Inbox[Setup](control).take()
+    setup, warm = _warmed_up(Inbox[Setup | WarmUp](control))
     delay = prepare("tracker", setup)
     spans = Spans()
     ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
@@ -94,7 +106,7 @@ def run_tracker(
     stage = TrackStage(tracker, _schedule(setup), PrefetchingInbox[MapUpdate](updates))
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), Outbox(to_mapper)
-    ready("tracker", setup, to_main)
+    ready("tracker", setup, to_main, warm=warm)
     meter, tidy = HealthMeter("tracker", to_main.send), Release(RELEASE_IMAGES)
     frame_id = -1
     while isinstance(message := _next_image(inbox), SlotImage):

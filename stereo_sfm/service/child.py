@@ -8,14 +8,18 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS, ignored_by_children
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.pipeline.threads import thread_environment
+from stereo_sfm.pipeline.watchdog import HEARTBEAT_S, SILENT_S, Watchdog
+
+log = logging.getLogger(LOGGER)
 
 TIDY_S = 0.6  # for the libraries of an output to clean up, of the second that it has for its end
 
@@ -37,6 +41,27 @@ def start_child(name: str, body: Callable[..., None], *arguments: Any) -> BasePr
         if isinstance(argument, Connection):
             argument.close()
     return process
+
+
+def follow(name: str, process: BaseProcess, reports: Connection, take: Callable[[object], None]) -> None:
+    """Take the messages of a child until it ends. One that sends no heartbeat is killed, also while it starts.
+
+    Only who has read everything may say that a child is silent: on a busy computer the service may be what is late.
+    """
+    assert process.pid is not None
+    watchdog, checked_s = Watchdog({name: process.pid}, log.warning, SILENT_S), time.monotonic()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            if wait([reports], HEARTBEAT_S):
+                message = reports.recv()
+                watchdog.received(name, message)
+                take(message)
+            passed_s = time.monotonic() - checked_s
+            checked_s += passed_s
+            if passed_s > 2 * HEARTBEAT_S:  # this process stood still itself
+                watchdog.excuse(passed_s)
+            elif watchdog.silent([name]):
+                process.kill()
 
 
 def end_with_service() -> None:

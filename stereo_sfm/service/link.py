@@ -21,7 +21,8 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.channels import DroppingOutbox
 from stereo_sfm.pipeline.text import LOGGER, emit
-from stereo_sfm.service.child import Send, pipe, run_child, start_child
+from stereo_sfm.pipeline.watchdog import HeartbeatThread
+from stereo_sfm.service.child import Send, follow, pipe, run_child, start_child
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import ServiceMessage
 from stereo_sfm.service.outputs import OUTPUTS
@@ -128,9 +129,7 @@ class OutputProcess:
         self.starts += 1
         self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT)
         self._replies = DroppingOutbox(to_client, LIMIT)
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                self._take(reports.recv())
+        follow(self.name, process, reports, self._take)
         self.wants = frozenset()
         reports.close()
         for outbox in (self._outbox, self._replies):
@@ -191,7 +190,13 @@ def run_output(
 ) -> None:
     """Body of the process of an output."""
 
+    name = module.partition(":")[0].rpartition(".")[2]
+
     def body(send: Send) -> None:
+        with HeartbeatThread(name, send):
+            publish(send)
+
+    def publish(send: Send) -> None:
         publisher = make_publisher(module, config)
         if not _open(publisher, PipeClient(send, replies), messages):
             return
@@ -201,7 +206,7 @@ def run_output(
                 publisher.put(pickle.loads(messages.recv_bytes()))
         publisher.close()
 
-    run_child(f"output {module.partition(':')[0].rpartition('.')[2]}", to_main, body, tidy=True)
+    run_child(f"output {name}", to_main, body, tidy=True)
 
 
 def make_publisher(module: str, config: RobotConfig) -> Publisher:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import shutil
 import threading
 import time
@@ -30,11 +29,10 @@ from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
-from stereo_sfm.pipeline.child import NICENESS
 from stereo_sfm.service.child import end_with_service, pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
-NICE = NICENESS["loop"]  # of the search for loops, which that stage makes, too
+RESTING = 3.0  # seconds that the search for loops rests for each of processor time: a quarter of a core at most
 
 
 @dataclass(frozen=True)
@@ -213,7 +211,7 @@ class MapStore:
 
 
 def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests: Connection, send: Connection) -> None:
-    """Body of the process: joins the session's part on request; a thread of low priority looks for its loops."""
+    """Body of the process: joins the session's part on request; a thread that mostly rests looks for its loops."""
     end_with_service()
     try:
         growing = GrowingMap(load_map(base), configured_vocabulary(config.loop), config)
@@ -235,24 +233,27 @@ def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests:
 
 
 def _search(growing: GrowingMap, step: threading.Lock, free: threading.Event, work: threading.Event) -> None:
-    """Work on the map whenever no request is carried out."""
-    if hasattr(os, "setpriority"):
-        thread = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + NICE)
+    """Work on the map whenever no request is carried out.
+
+    A thread of low priority would hold the map, and the interpreter, for seconds on a busy computer while a request
+    waits for it. So this one rests instead.
+    """
     while True:
         work.wait()
         free.wait()
+        begun_s = time.thread_time()
         with step:
             work.clear()
             if growing.work():
                 work.set()
+        time.sleep(RESTING * (time.thread_time() - begun_s))
 
 
 def _grown(growing: GrowingMap, session: Path, out: Path) -> Joined:
     try:
         growing.take(load_map(session), load_place(session))
         saved = growing.saved()
-        save_map(saved, out)
+        save_map(saved, out, compress=False)  # a fifth larger, in a sixth of the processor time
     except (StereoSfmError, OSError) as error:
         return Joined(why=str(error))
     return Joined(len(saved))

@@ -41,7 +41,7 @@ class Status:
 
 @dataclass(frozen=True, eq=False)
 class Started(Message):
-    """A pipeline is up; its first pose follows."""
+    """A pipeline is up, and its first pose follows; sent again in a session when the camera's tilt was measured."""
 
     session: int
     source: str

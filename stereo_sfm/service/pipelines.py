@@ -7,15 +7,17 @@ import threading
 import time
 
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import Opener, SourceChoice, with_known_start
+from stereo_sfm.drivers.choice import Opener, SourceChoice, with_known_start, with_start_check
 from stereo_sfm.drivers.start_checked import RigChanged
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline.processes import StageDied
+from stereo_sfm.pipeline.standby import Standby
 from stereo_sfm.service.camera import same_camera
 from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_keeper import MapKeeper
 from stereo_sfm.service.recorder import Recorder
+from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.session import Session
 from stereo_sfm.service.states import Facts
 
@@ -44,10 +46,14 @@ class Pipelines:
         opener: of the source. config: of the stages. silent_s: after which a stage counts as hung.
         maps, recorder, hub, health: what each session uses. facts: kept up to date.
         """
-        self._opener, self._config, self._silent_s = opener, config, silent_s
+        self._opener = with_start_check(opener, config.self_calibration.mode == "auto")
+        self._config, self._silent_s = config, silent_s
         self._maps, self._recorder, self._hub = maps, recorder, hub
         self._facts, self._health = facts, health
+        self._mounting = RobotMounting()
         self.session: Session | None = None  # the one that runs
+        self._standby: Standby | None = None  # the stages of the next one
+        self._standby_lock, self._standby_after_s, self._over = threading.Lock(), 0.0, False
         self.count = 0  # pipelines started so far
         self._restarting = False  # the pipeline is stopped to be started again
         self._failures = 0  # starts in a row that failed
@@ -60,12 +66,42 @@ class Pipelines:
         """The session, once its first image has come."""
         return None if self._facts.starting else self.session
 
+    def check(self) -> None:
+        """Have the stages of the next pipeline wait once this one is stable; call it regularly, in one thread."""
+        session = self.session
+        stable = session is not None and session.tracking_s > STABLE_S and not self.stopping.is_set()
+        with self._standby_lock:
+            if self._standby is not None and not self._standby.alive:
+                self._standby.close()
+                self._standby, self._standby_after_s = None, time.monotonic() + LONGEST_PAUSE_S
+            due = self._standby is None and time.monotonic() >= self._standby_after_s
+            if session is not None and stable and due and not self._over:
+                self._standby = Standby(self._config, session.rig)
+
+    def _take_standby(self) -> Standby | None:
+        """What waits for the next pipeline, if all of it does."""
+        with self._standby_lock:
+            standby, self._standby = self._standby, None
+        if standby is not None and not standby.alive:
+            standby.close()
+            return None
+        return standby
+
     def run(self) -> None:
         """Run pipelines until the source ends or `stop`.
 
         Raises:
             StereoSfmError: a pipeline cannot be started, and another attempt would not help.
         """
+        try:
+            self._run_all()
+        finally:
+            self._over = True
+            standby = self._take_standby()
+            if standby is not None:
+                standby.close()
+
+    def _run_all(self) -> None:
         while not self.stopping.is_set():
             ended = self._run_once()
             if ended and not self._restarting:
@@ -117,7 +153,8 @@ class Pipelines:
             return False
         session = self.session = Session(
             self.count, self._opener, self._config, folders, self._hub, self._facts, self._health,
-            self._silent_s, self._recorder, self._maps.session_saved,
+            self._silent_s, self._recorder, self._maps.session_saved, self._mounting,
+            None if self._maps.mode == "none" else self._maps.folder, self._take_standby,
         )  # fmt: skip
         if self.stopping.is_set():
             return True
@@ -131,6 +168,8 @@ class Pipelines:
         except StageDied as error:
             self._health.restarts += 1
             self._failures = 0 if session.tracking_s > STABLE_S else self._failures + 1
+            if session.frames:  # poses come sooner: it is the same camera with the same calibration
+                self._opener = with_known_start(self._opener, session.start_check)
             self._facts.starting = str(error).partition("\n")[0].partition(";")[0]
             log.error("%s: the pipeline is started again with the newest saved map", self._facts.starting)
             log.info("%s", error)

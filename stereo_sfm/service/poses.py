@@ -59,12 +59,18 @@ class PoseConverter:
     """The poses of one session."""
 
     def __init__(self, rig: Rig, session: int, clock: HostClock) -> None:
-        self._left_T_body = se3.inverse(rig.body_T_left)
-        self._adjoint = se3.adjoint(rig.body_T_left)
+        self._left_T_body, self._adjoint = np.eye(4), np.eye(6)
         self._session, self._clock = session, clock
         self._map_frames: dict[int, tuple[F64, F64]] = {0: (np.eye(4), np.zeros(3))}  # map_T_odom, gravity in the map
         self._localized_from: int | None = None
         self._before: tuple[int, F64, F64] | None = None  # stamp, odom_T_body, covariance in body axes
+        self.mount(rig)
+
+    def mount(self, rig: Rig) -> None:
+        """Where the camera is on the body, from the next frame on."""
+        self._left_T_body = se3.inverse(rig.body_T_left)
+        self._adjoint = se3.adjoint(rig.body_T_left)
+        self._before = None
 
     def localized(self, message: Localized) -> None:
         """The saved map was found."""

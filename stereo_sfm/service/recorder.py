@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
@@ -18,10 +17,9 @@ from stereo_sfm.pipeline.channels import DroppingOutbox
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.text import LOGGER, emit
-from stereo_sfm.pipeline.watchdog import Watchdog
 from stereo_sfm.recording.quota import GB, Quota
 from stereo_sfm.recording.segment_recorder import THUMBNAIL_S, Policy, RecorderState
-from stereo_sfm.service.child import pipe, start_child
+from stereo_sfm.service.child import follow, pipe, start_child
 from stereo_sfm.service.config import RecordingConfig
 from stereo_sfm.service.link import FIRST_PAUSE_S, LONGEST_PAUSE_S, STABLE_S
 from stereo_sfm.service.recorder_process import CLOSE_S, Begin, Finish, Mark, Read, run_recorder
@@ -42,7 +40,6 @@ RECORDED = (
 )
 WAITING = 20_000  # messages for the recorder, beyond which the oldest are lost
 HELD = 6  # images that the recorder has not read yet
-SILENT_S = 3.0
 
 
 def policy_of(config: RecordingConfig, mode: str) -> Policy:
@@ -69,7 +66,6 @@ class Recorder:
         self._lock = threading.RLock()
         self._process: BaseProcess | None = None
         self._outbox: DroppingOutbox | None = None
-        self._watchdog: Watchdog | None = None
         self._closing = False
         self._over = threading.Event()
         self._started_s = self._pause_s = 0.0  # when the process was started; before it is started again
@@ -168,18 +164,11 @@ class Recorder:
     def _start_process(self) -> None:
         (messages, send), (reports, to_main) = pipe(), pipe()
         process = start_child("recorder", run_recorder, messages, to_main)
-        assert process.pid is not None
         self._process, self._outbox, self._started_s = process, DroppingOutbox(send, WAITING), time.monotonic()
-        self._watchdog = Watchdog({"recorder": process.pid}, log.warning, SILENT_S)
         threading.Thread(target=self._listen, args=(process, reports), name="recorder", daemon=True).start()
 
     def _listen(self, process: BaseProcess, reports: Connection) -> None:
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                message = reports.recv()
-                if self._watchdog is not None:
-                    self._watchdog.received("recorder", message)
-                self._take(message)
+        follow("recorder", process, reports, self._take)
         reports.close()
         process.join()
         with self._lock:
@@ -190,7 +179,7 @@ class Recorder:
             self._held.clear()
             if self._outbox is not None:
                 self._outbox.close()
-            self._process = self._outbox = self._watchdog = None
+            self._process = self._outbox = None
             if self._closing:
                 return
             lived = time.monotonic() - self._started_s
@@ -214,12 +203,6 @@ class Recorder:
         elif isinstance(message, LogLine):
             emit(message)
 
-    def check(self) -> None:
-        """Kill a process that hangs; call it regularly."""
-        watchdog, process = self._watchdog, self._process
-        if watchdog is not None and process is not None and watchdog.silent(["recorder"]):
-            process.kill()
-
     def close(self) -> None:
         """Write everything that the disk takes in time."""
         with self._lock:
@@ -231,6 +214,7 @@ class Recorder:
         if process is not None:
             process.join(CLOSE_S + 0.5)
             if process.is_alive():
-                log.warning("the recorder did not end in time: the last seconds may be missing")
+                if self.state.recording:
+                    log.warning("the recorder did not end in time: the last seconds may be missing")
                 process.kill()
                 process.join()

@@ -158,8 +158,8 @@ class Service(Commands):
         self._check()  # once more: the outputs get the final state
 
     def _check(self) -> None:
-        """Each on its own: the state, the watchdogs and the saved map depend on the thread that does this."""
-        for check in (self._check_maps, self._recorder.check, self._reporter.report):
+        """Each on its own: the state and the saved map depend on the thread that does this."""
+        for check in (self._check_maps, self._pipelines.check, self._reporter.report):
             try:
                 check()
             except Exception:

@@ -9,20 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.calib.camera_store import CorrectionKeeper
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import Opener, with_start_check
+from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
+from stereo_sfm.pipeline.standby import Standby
 from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_cloud import MapCloudBuilder
 from stereo_sfm.service.messages import Event, PoseUpdate, PreviewImage, Started
 from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
+from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.states import Facts
-from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations
+from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations, StartCheck
 
 log = logging.getLogger("stereo_sfm")
 
@@ -44,16 +47,19 @@ class Session:
         silent_s: float,
         recorder: Recorder,
         map_saved: Callable[[MapSaved], None],
+        mounting: RobotMounting,
+        map_folder: Path | None,
+        standby: Callable[[], Standby | None] = lambda: None,
     ) -> None:
-        opener = with_start_check(opener, config.self_calibration.mode == "auto")
         self.number, self._opener, self._config, self._folders = number, opener, config, folders
         self._hub, self._facts, self._health, self._map_saved = hub, facts, health, map_saved
-        self._recorder = recorder
+        self._recorder, self._mounting, self._map_folder = recorder, mounting, map_folder
         self._clock = HostClock()
         self._observations = Observations.empty()  # of the newest frame
         self._next_preview_s = 0.0
         self.serial = ""  # of the camera
         self.localized = False
+        self.start_check: StartCheck | None = None  # what its first images said about the calibration
         self.frames = 0
         self._first_frame_s = float("inf")
         self._handlers: dict[type[Any], Callable[[Any], None]] = {
@@ -64,6 +70,7 @@ class Session:
             MapSaved: self._map_saved,
             LogLine: self._line,
             Compiling: self._compiling,
+            StartCheck: self._checked,
         }
         self._poses: PoseConverter | None = None
         self._corrections: CorrectionKeeper | None = None
@@ -76,6 +83,7 @@ class Session:
             images=self._image,
             silent_s=silent_s,
             pose_first=number > 1,  # a robot may be moving
+            standby=standby,
         )
 
     @property
@@ -104,11 +112,12 @@ class Session:
             with self._run as run:
                 info = run.info
                 self.serial, self._clock.live = info.rig.serial, info.live
-                self._poses = PoseConverter(info.rig, self.number, self._clock)
+                rig = self._mounting.begin(info.rig, self._map_folder)
+                self._poses = PoseConverter(rig, self.number, self._clock)
                 self._corrections = CorrectionKeeper(self._opener.camera_store, info.rig, info.given_rig)
                 opening = self._folders.opening(self._opener.opening(info.rig))
                 self._recorder.begin(run, self._config, self._opener.spec or info.name, opening)
-                self._hub.publish(Started(self.number, info.name, info.rig, info.live))
+                self._hub.publish(Started(self.number, info.name, rig, info.live))
                 for _ in run:
                     pass
         except KeyboardInterrupt:  # `stop` while the source was being opened
@@ -127,6 +136,11 @@ class Session:
         Args: folder, replaced. urgent: the session is about to be stopped.
         """
         self._run.save_map(folder, urgent)
+
+    @property
+    def rig(self) -> Rig:
+        """Of its source, once it has frames."""
+        return self._run.info.rig
 
     def relocalize(self) -> None:
         """Search the whole saved map with the next keyframe."""
@@ -180,6 +194,10 @@ class Session:
 
     def _keyframe(self, keyframe: Keyframe) -> None:
         self._map.put(keyframe)
+        rig = self._mounting.keyframe(keyframe)
+        if rig is not None and self._poses is not None:
+            self._poses.mount(rig)
+            self._hub.publish(Started(self.number, self._run.info.name, rig, self._run.info.live))
 
     def _update(self, update: MapUpdate) -> None:
         assert self._poses is not None
@@ -195,6 +213,9 @@ class Session:
         self._poses.localized(message)
         self._map.localized(message.version)
         log.info("the saved map was recognised: poses are in its frame")
+
+    def _checked(self, check: StartCheck) -> None:
+        self.start_check = check
 
     def _compiling(self, _: Compiling) -> None:
         """The first start after an installation takes up to minutes: the state says why."""

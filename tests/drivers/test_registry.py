@@ -14,7 +14,7 @@ import pytest
 from stereo_sfm import drivers
 from stereo_sfm.drivers import open_source, registry
 from stereo_sfm.drivers.driver import Certainty, Driver
-from stereo_sfm.drivers.options import SourceOptions, described
+from stereo_sfm.drivers.options import SourceOptions, described, grouped
 from stereo_sfm.drivers.source import is_device, look_up, path_of
 from stereo_sfm.errors import StereoSfmError
 
@@ -37,6 +37,9 @@ def test_a_driver_describes_itself(kind: str) -> None:
     assert is_dataclass(found.options) and issubclass(found.options, SourceOptions) and found.options.__doc__
     helps = list(described(found.options))
     assert len(helps) == len(fields(found.options)) and all(h.doc for h in helps)
+    names = [name for group in found.options.GROUPS.values() for name in group]
+    assert len(names) == len(set(names)) and set(names) <= {f.name for f in fields(found.options)}
+    assert sum(len(group) for _, group in grouped(found.options)) == len(helps)
     place = {"sim": "loop", "video": "drive.mp4"}.get(kind, "")
     assert found.options() == look_up(f"{kind}:{place}").options
 

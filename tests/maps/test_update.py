@@ -15,8 +15,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.maps.changes import changed_cells, describe_changes
 from stereo_sfm.maps.labels import Aisle
-from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
-from stereo_sfm.maps.store import lock, read_about, versions, write_version
+from stereo_sfm.maps.replace_folder import replaced_folder
+from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
+from stereo_sfm.maps.store import load_current, lock, read_about, versions, write_version
 from stereo_sfm.maps.unfinished import publish, save_session
 from stereo_sfm.maps.update import KEPT_SESSIONS, Update, update
 from stereo_sfm.types import F64, U8, Keyframe
@@ -214,6 +215,37 @@ def test_versions_undo_labels_and_what_people_put_beside(tmp_path: Path, capsys:
 def _as_saved(saved: SavedMap, folder: Path) -> SavedMap:
     save_map(saved, folder / "other")
     return load_map(folder / "other")
+
+
+def test_labels_and_plans_while_a_service_extends_the_map(tmp_path: Path) -> None:
+    saved, store = small_map()[1], tmp_path / "store"
+    save_map(saved, store)
+    with lock(store), replaced_folder(store, map_files()) as draft:  # a save under way
+        for path in store.iterdir():
+            (draft / path.name).write_bytes(path.read_bytes())
+        assert main(["map", "label", str(store), "aisle 4", "0,0", "9.5,0"]) == 0
+        assert main(["map", "plan", str(store)]) == 0
+        assert main(["map", "update", str(store), str(store)]) == 2
+    assert [aisle.name for aisle in read_about(store).aisles] == ["aisle 4"]
+    assert (store / "floor_plan.pgm").exists() and same(load_map(store).snapshot, saved.snapshot)
+
+
+def test_a_map_that_is_replaced_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps, store, read = [small_map(seed)[1] for seed in range(2)], tmp_path / "store", list[int]()
+    save_map(maps[0], store)
+
+    def replaced(folder: Path) -> SavedMap:
+        read.append(1)
+        if len(read) == 1:
+            save_map(maps[1], store)
+            raise StereoSfmError("damaged: files of two versions")
+        return load_map(folder)
+
+    monkeypatch.setattr("stereo_sfm.maps.store.load_map", replaced)
+    assert len(load_current(store).snapshot.pt_ids) == len(maps[1].snapshot.pt_ids) and len(read) == 2
+    (store / "points.npz").write_bytes(b"damaged")
+    with pytest.raises(StereoSfmError):
+        load_current(store)
 
 
 def test_only_one_writer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,7 +59,7 @@ class Browser:
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
         while True:
-            said = json.loads(self._socket.recv(timeout=30))
+            said = json.loads(self._socket.recv(timeout=120))
             if said.get("id") == number:
                 assert "error" not in said, said
                 return said["result"]

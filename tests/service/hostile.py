@@ -13,6 +13,8 @@ TOKEN = "a-token-of-thirty-two-characters"
 PATHS = (
     "/", "/page.js", "/login", "/api/live", "/api/map", "/api/image.jpg", "/api/settings", "/api/recordings",
     "/api/recordings/r1", "/api/recordings/r1/0", "/api/recordings/r1/%s" % ("9" * 5000), "/api/recordings/r1/-1",
+    "/api/recordings/r1/timeline", "/api/recordings/%00/timeline", "/api/recordings/r1/thumbnails/0",
+    "/api/recordings/r1/thumbnails/%s" % ("9" * 5000), "/api/recordings/../../etc/thumbnails/-1",
     "/api/recordings/%00/1", "/api/recordings/%ff%fe/1", "/api/recordings/..%2f..%2fetc/0", "/api/command/mark",
     "/api/command/set_setting", "/api/command/delete_recording", "/api/command/%s" % ("x" * 3000), "/api/command/", "*",
     "//", "/../../etc/passwd", "/%", "/%zz", "/\u00e9", "http://evil.example/",

@@ -11,8 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
+import numpy as np
 import psutil
 import pytest
 
@@ -22,12 +23,12 @@ from stereo_sfm.maps import unfinished
 from stereo_sfm.maps.store import lock
 from stereo_sfm.messages import MapSaved, SaveMap
 from stereo_sfm.pipeline import map_saver
-from stereo_sfm.pipeline.map_saver import NICE, MapSaver
+from stereo_sfm.pipeline.map_saver import MapSaver
 from stereo_sfm.service import map_keeper
 from stereo_sfm.service.child import end_with_service, start_child
 from stereo_sfm.service.config import MapConfig
 from stereo_sfm.service.map_keeper import ENDING, MapKeeper
-from stereo_sfm.service.map_store import Joined
+from stereo_sfm.service.map_store import Joined, _search  # pyright: ignore[reportPrivateUsage]
 
 
 class SlowSession:
@@ -190,8 +191,7 @@ def test_the_process_that_saves_ends_with_the_service() -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities of threads")
-@pytest.mark.parametrize("urgent", [False, True])
-def test_the_last_save_is_written_without_yielding(urgent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_save_is_written_without_yielding(monkeypatch: pytest.MonkeyPatch) -> None:
     written, replies = list[int](), list[MapSaved]()
 
     def save(saved: object, place: object, folder: Path) -> None:
@@ -202,11 +202,36 @@ def test_the_last_save_is_written_without_yielding(urgent: bool, monkeypatch: py
     mapper: Any = SimpleNamespace(place=lambda: None)
     saver = MapSaver(mapper, Config(), replies.append)
     inbox, control = SimpleNamespace(connection=Pipe(False)[0], take=lambda: None), Pipe(False)
-    control[1].send(SaveMap(Path("x"), urgent))
+    control[1].send(SaveMap(Path("x")))
     control[1].close()
     any_inbox: Any = inbox
     threading.Thread(target=saver.next, args=(any_inbox, control[0])).start()
     while not replies:
         time.sleep(0.01)
-    nice = os.getpriority(os.PRIO_PROCESS, 0)
-    assert written == [nice if urgent else max(nice, NICE)]
+    assert written == [os.getpriority(os.PRIO_PROCESS, 0)]
+
+
+def test_the_search_for_loops_rests_between_its_steps() -> None:
+    class Growing:
+        begun: ClassVar[list[float]] = []
+
+        def work(self) -> bool:
+            self.begun.append(time.monotonic())
+            until = time.thread_time() + 0.05
+            while time.thread_time() < until:
+                pass
+            return True
+
+    growing: Any = Growing()
+    step, free, work = threading.Lock(), threading.Event(), threading.Event()
+    free.set()
+    work.set()
+    threading.Thread(target=_search, args=(growing, step, free, work), daemon=True).start()
+    while len(growing.begun) < 5:
+        time.sleep(0.01)
+    free.clear()  # a request is carried out: no further step begins
+    with step:
+        done = len(growing.begun)
+        time.sleep(0.5)
+        assert len(growing.begun) == done
+    assert np.diff(growing.begun).min() > 4 * 0.05 - 0.01

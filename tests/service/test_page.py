@@ -21,6 +21,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED
 from stereo_sfm.geometry import se3
 from stereo_sfm.recording.describe import describe_file
+from stereo_sfm.recording.segments import recordings, segments
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import Event, ServiceState
 from stereo_sfm.service.outputs.access import Access, Links
@@ -39,6 +40,8 @@ from stereo_sfm.service.page.server import PageOutput
 from stereo_sfm.service.page.verdicts import GOOD, Verdicts, problems
 from stereo_sfm.service.publisher import COMMANDS, Reply
 from stereo_sfm.types import U8
+from tests.pipeline.test_pipeline import SlidingWall
+from tests.recording.test_segments import record, start
 from tests.service.browser import CHROMIUM, Browser
 from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
 
@@ -320,6 +323,77 @@ def test_recordings_are_loaded_by_id_and_number(tmp_path: Path) -> None:
         ):  # fmt: skip
             code, data, _ = _ask(output, "GET", path)
             assert code == 404 and b"secret" not in data, path
+
+
+def _recorded(root: Path) -> Path:
+    """A recording of five seconds in segments of one."""
+    recorder = start(root)
+    record(recorder, list(SlidingWall(150)))
+    recorder.close(20.0)
+    return recordings(root)[0]
+
+
+def test_a_recording_is_played_back_by_its_thumbnails(tmp_path: Path) -> None:
+    folder = _recorded(tmp_path)
+    service = FakeService({"recording_files": Reply(True, "", {"files": [str(p) for p in sorted(folder.iterdir())]})})
+    with _serving(service) as output:
+        place = f"/api/recordings/{folder.name}"
+        code, data, _ = _ask(output, "GET", f"{place}/timeline")
+        times = json.loads(data)
+        assert code == 200 and times[0] == 0.0 and np.allclose(np.diff(times), 2.0, atol=0.1) and len(times) == 3
+        images = [_ask(output, "GET", f"{place}/thumbnails/{k}") for k in range(3)]
+        assert all(code == 200 and data[:2] == b"\xff\xd8" for code, data, _ in images)
+        assert len({data for _, data, _ in images}) == 3
+        assert _ask(output, "GET", f"{place}/thumbnails/3")[0] == 204
+        last = segments(folder)[-1].poses
+        last.write_bytes(last.read_bytes()[:-8])  # it is being written
+        assert len(json.loads(_ask(output, "GET", f"{place}/timeline")[1])) < 3
+        last.write_bytes(b"\x89MCAP0\r\n" + bytes(200) + b"\x89MCAP0\r\n")
+        assert _ask(output, "GET", f"{place}/timeline")[0] in (200, 404)
+    gone = FakeService({"recording_files": Reply(False, "no recording")})
+    with _serving(gone) as output:
+        assert _ask(output, "GET", "/api/recordings/none/timeline")[0] == 404
+        assert _ask(output, "GET", "/api/recordings/none/thumbnails/0")[0] == 404
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+@pytest.mark.parametrize(("width", "height"), [(1440, 900), (390, 844)])
+def test_an_operator_plays_a_recording_by_keyboard_in_the_dark(width: int, height: int, tmp_path: Path) -> None:
+    folder = _recorded(tmp_path)
+    row = {
+        "id": folder.name, "began": "2026-11-22T10:00:00", "source": "wall", "mode": "full", "seconds": 5,
+        "segments": 5, "with_images": 5, "bytes": 12_000_000, "marked": False, "recording": False,
+    }  # fmt: skip
+    service = FakeService(
+        {
+            "recordings": Reply(True, "", {"recordings": [row]}),
+            "recording_files": Reply(True, "", {"files": [str(p) for p in sorted(folder.iterdir())]}),
+            "status": Reply(True, "", {"settings": {"recording.quota_gb": 20.0}}),
+        }
+    )
+    press = "document.getElementById('%s').dispatchEvent(new KeyboardEvent('keydown', {key: '%s', bubbles: true}))"
+    with _serving(service) as output, Browser(width, height) as browser:
+        browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
+        _show(output, 1)
+        browser.go(f"http://127.0.0.1:{output.port}/")
+        browser.until("document.querySelector('.thumbnail')?.naturalWidth > 0")
+        buttons = "[...document.querySelectorAll('#recordings button')]"
+        browser.run(f"{buttons}.find(b => b.textContent === 'play').click()")
+        browser.until("document.getElementById('player').open && document.getElementById('frame').naturalWidth > 0")
+        browser.until("played.at === 2 && !played.timer")  # played to its end
+        browser.run(press % ("player", "ArrowLeft"))
+        browser.until("played.at === 1 && document.getElementById('time').textContent === '0:02 of 0:04'")
+        browser.run(press % ("player", " "))
+        browser.until("played.timer !== 0 || played.at === 2")
+        dark = (
+            "getComputedStyle(document.body).backgroundColor + getComputedStyle(document.documentElement).colorScheme"
+        )
+        assert "light dark" in browser.run(dark) and browser.run("matchMedia('(prefers-color-scheme: dark)').matches")
+        assert browser.run("document.documentElement.scrollWidth") <= width
+        browser.screenshot(tmp_path / "player.png")
+        browser.run("document.getElementById('close').click()")
+        browser.until("!document.getElementById('player').open && !played.timer")
+        browser.screenshot(tmp_path / "dark.png")
 
 
 def test_commands_of_other_sites_and_too_large_ones_are_refused() -> None:

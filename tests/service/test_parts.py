@@ -33,6 +33,7 @@ from stereo_sfm.service.messages import Event, MapCloud, ServiceState, Status
 from stereo_sfm.service.notify import SystemdNotifier
 from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
+from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.session import COMPILING, Session
 from stereo_sfm.service.states import Facts, derive_state
 from stereo_sfm.types import F64, Frame, MapUpdate, Observations, StereoImage, TrackState
@@ -253,7 +254,7 @@ def test_the_first_start_says_that_kernels_are_compiled() -> None:
     facts = Facts()
     session = Session(
         1, lambda: RepeatedSource(SlidingWall(2)), Config(), MapFolders(), Hub([]), facts, HealthCollector(), 1.0,
-        Recorder(RecordingConfig()), lambda saved: None,
+        Recorder(RecordingConfig()), lambda saved: None, RobotMounting(), None,
     )  # fmt: skip
     session.put(Compiling("tracker", "track"))
     assert derive_state(facts, 0.0) == (ServiceState.STARTING, COMPILING)

@@ -74,6 +74,7 @@ def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: 
         pid = watched.service.pids["recorder"]
         os.kill(pid, fault)
         wait_for(lambda: watched.service.pids.get("recorder") not in (None, pid))
+        wait_for(lambda: len(recordings(tmp_path / "recordings")) == 2)
         watched.more_poses(90)
         assert watched.no_pose_is_missing() and watched.service.status().data["health"]["restarts"] == 0
     first, second = recordings(tmp_path / "recordings")

@@ -26,7 +26,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import require
 from stereo_sfm.log import foxglove, schema, topics
-from stereo_sfm.log.image_log import LEVEL_T_MAP, level_T_map
+from stereo_sfm.log.image_log import level_T_map
 from stereo_sfm.log.run_log import PATH_COLOR, age_colors
 from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import (
@@ -42,6 +42,7 @@ from stereo_sfm.service.messages import (
 )
 from stereo_sfm.service.outputs.access import Access, access
 from stereo_sfm.service.outputs.foxglove_protocol import Channel
+from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.settings import FoxgloveConfig, SecurityConfig
 from stereo_sfm.service.outputs.web_server import WebServer
 from stereo_sfm.service.publisher import ServiceClient
@@ -143,7 +144,8 @@ class FoxgloveOutput:
             return
         rig, stamp = self._rig, self._stamp_ns
         rows = [("body", "cam0", foxglove.pose(rig.body_T_left))]
-        rows += [("level", "map", foxglove.pose(LEVEL_T_MAP))] if rig.imu is None else []
+        up = RobotAxes(rig).base_T_left[2, :3]
+        rows += [("level", "map", foxglove.pose(level_T_map(-up)))] if rig.imu is None else []
         self._log(topics.LEFT_CALIBRATION, foxglove.calibration(rig.left, "cam0", stamp))
         if rig.second_camera is not None:
             rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))

@@ -13,10 +13,10 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route, Router
 from starlette.types import ASGIApp
@@ -25,6 +25,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.outputs.access import Access, Bucket, Links, TooManyAttempts
 from stereo_sfm.service.outputs.door import HANDSHAKE_S
 from stereo_sfm.service.outputs.guard import Guard, refusal
+from stereo_sfm.service.page import playback
 from stereo_sfm.service.page.settings_form import settings_form
 from stereo_sfm.service.page.state import PageState
 from stereo_sfm.service.page.verdicts import Verdicts
@@ -49,6 +50,7 @@ MOST_VIEWERS = 16
 REPLY_S = 30.0  # more than the service takes for any command
 
 Handler = Callable[[Request], Awaitable[Response]]
+T = TypeVar("T")
 
 
 class Page:
@@ -73,6 +75,8 @@ class Page:
             ("/api/settings", self._settings),
             ("/api/recordings", self._recordings),
             ("/api/recordings/{id}", self._files),
+            ("/api/recordings/{id}/timeline", self._timeline),
+            ("/api/recordings/{id}/thumbnails/{number:int}", self._thumbnail),
             ("/api/recordings/{id}/{number:int}", self._download),
         ]
         routes = [Route(path, self._file) for path in FILES]
@@ -180,6 +184,27 @@ class Page:
             return refusal(404, "the file no longer exists")
         return FileResponse(path, filename=f"{path.parent.name}_{path.name}", media_type="application/octet-stream")
 
+    async def _timeline(self, request: Request) -> Response:
+        """Seconds of a recording's thumbnails."""
+        found = await self._played(request, playback.timeline)
+        return found if isinstance(found, Response) else JSONResponse(found)
+
+    async def _thumbnail(self, request: Request) -> Response:
+        number = request.path_params["number"]
+        found = await self._played(request, lambda folder: playback.thumbnail(folder, number))
+        if isinstance(found, Response):
+            return found
+        kept = {"Cache-Control": "private, max-age=3600"}
+        return Response(found, media_type="image/jpeg", headers=kept) if found else Response(status_code=204)
+
+    async def _played(self, request: Request, read: Callable[[Path], T]) -> T | Response:
+        """What is read from a recording's folder, or why it cannot be."""
+        try:
+            folder = await run_in_threadpool(self._folder_of, request.path_params["id"])
+            return refusal(404, "no such recording") if folder is None else await run_in_threadpool(read, folder)
+        except (StereoSfmError, OSError) as error:
+            return refusal(404, str(error))
+
     async def _command(self, request: Request) -> Response:
         name = request.path_params["name"]
         if name not in COMMANDS:
@@ -214,11 +239,14 @@ async def _object(request: Request) -> dict[str, Any]:
     if not request.headers.get("content-type", "").startswith("application/json"):
         raise StereoSfmError("send the header Content-Type: application/json")
     data = b""
-    async with asyncio.timeout(HANDSHAKE_S):
-        async for part in request.stream():
-            data += part
-            if len(data) > BODY_BYTES:
-                raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
+    try:
+        async with asyncio.timeout(HANDSHAKE_S):
+            async for part in request.stream():
+                data += part
+                if len(data) > BODY_BYTES:
+                    raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
+    except ClientDisconnect:
+        raise StereoSfmError("the connection was closed before the end of the body") from None
     try:
         values = json.loads(data)
     except (ValueError, RecursionError):

@@ -198,7 +198,7 @@ const KEYS = { "+": () => zoom(1.5), "-": () => zoom(1 / 1.5), "0": wholeMap, f:
   r: () => $("record").click() };
 
 document.onkeydown = (event) => {
-  if (event.ctrlKey || event.altKey || event.metaKey || $("all").hidden) return;
+  if (event.ctrlKey || event.altKey || event.metaKey || $("all").hidden || $("player").open) return;
   if (["INPUT", "SELECT", "TEXTAREA"].includes(event.target.tagName)) return;
   const made = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
   if (made) made.click(); else if (Object.hasOwn(KEYS, event.key)) KEYS[event.key]();
@@ -216,17 +216,76 @@ async function refreshMap(version) {
   if (version !== map.version) map = await (await request("api/map")).json();
 }
 
+const clock = (seconds) => `${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
+const played = { id: "", times: [], at: 0, timer: 0 };  // the recording in the player
+const thumbnail = (id, k) => `api/recordings/${encodeURIComponent(id)}/thumbnails/${k}`;
+
+function showFrame(k) {
+  played.at = Math.max(0, Math.min(played.times.length - 1, k));
+  $("seek").value = played.at;
+  $("frame").src = thumbnail(played.id, played.at);
+  show("time", `${clock(played.times[played.at])} of ${clock(played.times[played.times.length - 1])}`);
+}
+
+function pause() {
+  clearTimeout(played.timer);
+  played.timer = 0;
+  show("play", "Play");
+}
+
+function playOn() {
+  const next = played.at + 1;
+  if (next >= played.times.length) { pause(); return; }
+  const wait = (played.times[next] - played.times[played.at]) / Number($("speed").value);
+  played.timer = setTimeout(() => { showFrame(next); playOn(); }, 1000 * Math.max(0.05, wait));
+  show("play", "Pause");
+}
+
+function playOrPause() {
+  if (played.timer) { pause(); return; }
+  if (played.at === played.times.length - 1) showFrame(0);
+  playOn();
+}
+
+async function openPlayer(id) {
+  const response = await request(`api/recordings/${encodeURIComponent(id)}/timeline`);
+  const times = response.ok ? await response.json() : [];
+  if (!times.length) { show("reply", `${id} has no images to show yet`); return; }
+  [played.id, played.times] = [id, times];
+  show("player-title", id);
+  $("seek").max = times.length - 1;
+  showFrame(0);
+  if (!$("player").open) $("player").showModal();
+  playOn();
+}
+
+function preparePlayer() {
+  $("play").onclick = playOrPause;
+  $("seek").oninput = () => { pause(); showFrame(Number($("seek").value)); };
+  $("close").onclick = () => $("player").close();
+  $("player").onclose = pause;
+  $("player").onkeydown = (event) => {
+    if (event.target.tagName === "SELECT" || event.key === "Escape") return;
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+    if (event.key === " ") playOrPause(); else if (step) { pause(); showFrame(played.at + step); } else return;
+    event.preventDefault();
+  };
+}
+
 async function refresh() {
   try {
     const rows = await (await request("api/recordings")).json(), table = document.createElement("table");
     table.id = "recordings";
     for (const r of Array.isArray(rows) ? rows : []) {
       const open = button("files", () => listFiles(r.id)), actions = document.createElement("span");
-      actions.append(open, button("delete", () => confirm(`Delete ${r.id}?`) && command("delete_recording", { id: r.id })));
-      const length = `${Math.floor(r.seconds / 60)}:${String(Math.floor(r.seconds % 60)).padStart(2, "0")} min`;
+      actions.append(button("play", () => openPlayer(r.id)), open, button("delete", () => confirm(`Delete ${r.id}?`) && command("delete_recording", { id: r.id })));
+      const length = `${clock(r.seconds)} min`, small = document.createElement("img");
+      [small.className, small.alt, small.loading] = ["thumbnail", "", "lazy"];
+      small.onerror = () => { small.hidden = true; };
+      if (!r.recording) small.src = thumbnail(r.id, 0); else small.hidden = true;
       const lean = r.segments - r.with_images;
       const size = `${length}, ${number(r.bytes / 1e6, 0)} MB, ${r.mode}${lean ? `, ${lean} of ${r.segments} segments without images` : ""}`;
-      row(table, [`${r.id}${r.marked ? " ★" : ""}`, size, r.verdict, actions]);
+      row(table, [small, `${r.id}${r.marked ? " ★" : ""}`, size, r.verdict, actions]);
     }
     if (!table.rows.length) row(table, ["none"]);
     $("recordings").replaceWith(table);
@@ -332,6 +391,7 @@ for (const made of document.querySelectorAll("[data-command]")) {
   made.onclick = () => (!made.dataset.ask || confirm(made.dataset.ask)) && command(made.dataset.command);
 }
 prepareView();
+preparePlayer();
 setInterval(nextImage, 300);
 setInterval(refresh, 10000);
 setInterval(() => { if (last) showState(last); if (!live && $("login").hidden) start().catch(() => {}); }, 2000);
