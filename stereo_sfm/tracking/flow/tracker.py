@@ -153,7 +153,7 @@ class Tracker:
         if self._state == TrackState.INITIALIZING:
             return self._begin(image, images)
         expected = self._predict(image.stamp_ns)
-        blind = self._loss.frames and self._sensors is None
+        blind = self._loss.frames and self._bridge(image.stamp_ns) is None
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
         if solution.reason:
             tracks, solution = self._search(image, images)
@@ -417,7 +417,8 @@ class Tracker:
         """Relocalize a lost camera with the points of the last trusted image, from several hypotheses of its pose."""
         self._hold_more()
         expected = self._expect(image.stamp_ns)
-        steady = self._recovery.motion.steady(image.stamp_ns) if self._sensors is None else None
+        bridged = self._bridge(image.stamp_ns) is not None
+        steady = None if bridged else self._recovery.motion.steady(image.stamp_ns)
         seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
         tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
