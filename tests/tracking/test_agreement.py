@@ -92,3 +92,11 @@ def test_wheels_count_once_they_agree() -> None:
         silent.add(0.5, np.eye(4), moved)
         assert not silent.agreed
     assert silent.left_out and silent.silent
+
+
+def test_wheels_that_turn_the_wrong_way_are_left_out_in_a_turn() -> None:
+    window = WheelWindow("differential", 0.05)
+    for turn, left_out in ((0.0, False), (0.2, True), (0.2, True)):
+        for _ in range(6):
+            window.add(0.5, *(se3.exp(np.array([0.2, 0, 0, 0, 0, sign * turn])) for sign in (-1.0, 1.0)))
+        assert window.left_out == left_out

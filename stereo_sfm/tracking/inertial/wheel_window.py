@@ -22,7 +22,7 @@ TURN_FREE = 0.03, 0.1  # rad and share by which turns differ without slip
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.003, 0.003  # standard deviation of a link's difference, at least
 SHOWN, JUDGED = 2, 6  # links for the comparison with the images: before they count, and before they are left out
 WRONG, RIGHT = 0.5, 0.25  # of the way: more is another motion, less is the same again
-NOTICED_M = 0.1  # of way, before anything is judged
+NOTICED_M, NOTICED_RAD = 0.1, 0.1  # of way and of turns, before anything is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +77,18 @@ class WheelWindow:
 
     def _judge(self) -> None:
         recent = list(self._links)[-JUDGED:]
-        off = sum(float(((k.way - k.seen) ** 2).sum()) for k in recent)
-        way = sum(max(float((k.way**2).sum()), float((k.seen**2).sum())) for k in recent)
-        if way <= NOTICED_M**2:
+        ways = [(np.sum((k.way - k.seen) ** 2), max(k.way @ k.way, k.seen @ k.seen)) for k in recent]
+        turns = [((k.turn - k.turn_seen) ** 2, max(k.turn**2, k.turn_seen**2)) for k in recent]
+        judged = [
+            float(off / size)
+            for (off, size), noticed in ((np.sum(ways, 0), NOTICED_M), (np.sum(turns, 0), NOTICED_RAD))
+            if size > noticed**2
+        ]
+        if not judged:
             return
         if len(recent) == JUDGED:
-            self.left_out = off > ((RIGHT if self.left_out else WRONG) ** 2) * way
-        if len(recent) >= SHOWN and off <= RIGHT**2 * way:
+            self.left_out = max(judged) > (RIGHT if self.left_out else WRONG) ** 2
+        if len(recent) >= SHOWN and max(judged) <= RIGHT**2:
             self.agreed = True
         self.agreed &= not self.left_out
 
