@@ -85,6 +85,14 @@ SEQUENCES = (
         "bonn_crowd_8s", "rgbd_bonn_crowd", Limits(median_ate_m=0.02, lost=None, lost_share=0.05, moves_more=True),
         starts_s=BONN_STARTS_S, duration_s=8.0, kind="depth", rig="bonn_rig.yaml",
     ),
+    # Of jmstark/gpu_odometry, Frozenheart1998/PclMapping, MissingLight/Stereo-Vision-SLAM, andyzeng/tsdf-fusion-python
+    # (depth registered to colour) and edufschmidt/stereo-vo: first run when everything else was built.
+    Sequence("fr1_rpy", "rgbd_dataset_freiburg1_rpy", rate_hz=30.0, kind="depth"),
+    Sequence("kitti_06_grey", "kitti_06_grey/sequences/06", rate_hz=9.65),
+    Sequence("kitti_06_colour", "kitti_06_colour/sequences/06", rate_hz=9.65),
+    Sequence("kitti_raw_0926", "kitti_raw_0926_1310"),
+    Sequence("seven_scenes", "seven_scenes", rate_hz=30.0, kind="depth", rig="seven_scenes_rig.yaml"),
+    Sequence("backyard", "backyard_bumblebee", rate_hz=12.0),
     Sequence("karlsruhe_part", "karlsruhe_part", rate_hz=9.5, shared=True),
     Sequence("kitti_00_part", "kitti", rate_hz=9.65, shared=True, best_cpp="0.319 m", long=True),
     Sequence("euroc_mh01_part", "euroc_mh01", rate_hz=20.0, shared=True, kind="inertial", best_cpp="4.6 mm", long=True),
