@@ -90,7 +90,9 @@ class InertialMotion:
         if newest_ns is None:
             return "no samples came"
         away_s = abs(self._last_ns - newest_ns) * 1e-9
-        return "its stamps have another clock than the images'" if away_s > MISSING_S else "samples are missing (a warning of the source may say why)"
+        if away_s > MISSING_S:
+            return "its stamps have another clock than the images'"
+        return "samples are missing (a warning of the source may say why)"
 
     @property
     def left_R_imu(self) -> F64:
