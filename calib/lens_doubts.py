@@ -39,7 +39,7 @@ def fisheye_in_disguise(camera: Camera) -> bool:
 
 
 def believable(cameras: list[Camera], where: str, warn: Callable[..., None] = log.warning) -> list[Camera]:
-    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; `warn` is told."""
+    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; `warn` gets the message."""
     worst = max(cameras, key=lambda camera: tilt_deg(camera) if fisheye_in_disguise(camera) else 0.0)
     if not fisheye_in_disguise(worst):
         return cameras

@@ -219,7 +219,7 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
     if stats["row_errors"] is not None and stats["row_errors"]["warning"]:
         rows = stats["row_errors"]["systematic_px"]
         out.append(f"**WARN**: the calibration does not fit the images (row error {rows:.2f} px): see check-calib")
-    if stats["pieces"] == 1:  # else the submaps' relative poses are wrong, not the lengths
+    if stats["pieces"] <= 1:  # else the submaps' relative poses are wrong, not the lengths
         out += [text for name, result in evaluations.items() if (text := _length(name, result))]
     if not out and stats["tracked"]:
         out.append(passed(stats))
