@@ -124,8 +124,8 @@ RULES = (
     _rule(
         "places of lost movers",
         MARKS,
-        "lost = moved & ~np.isin(before.point_ids, after.point_ids)",
-        "lost = moved & False",
+        "lost = before.disagreed & ~np.isin(before.point_ids, after.point_ids)",
+        "lost = before.disagreed & False",
     ),
     _rule(
         "corners on moving objects",
@@ -150,7 +150,7 @@ RULES = (
     _rule(
         "steady motion",
         TRACKER,
-        "self._recovery.motion.steady(image.stamp_ns) if self._sensors is None else None",
+        "None if bridged else self._recovery.motion.steady(image.stamp_ns)",
         "None",
     ),
     _rule("other motions are tried", RECOVERY, "if self.free and expected.sigma_m > UNCERTAIN_M:", "if False:"),

@@ -63,6 +63,7 @@ CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard dev
 HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
+FOLLOWED_S = 0.5  # without a pose: with 2 m/s^2, a robot is a quarter of a metre from where it was expected
 FEW_RIGHT = 0.75  # of the share of points that had a right pixel before: they are looked for farther away ...
 RIGHT_LEVEL = 2  # ... from this level of the pyramids on
 
@@ -153,7 +154,9 @@ class Tracker:
         if self._state == TrackState.INITIALIZING:
             return self._begin(image, images)
         expected = self._predict(image.stamp_ns)
-        blind = self._loss.frames and self._bridge(image.stamp_ns) is None
+        # Who was covered for longer may be elsewhere: what is followed from the last image then is found by chance.
+        long_lost = (image.stamp_ns - self._stamp_ns) * 1e-9 > FOLLOWED_S
+        blind = self._loss.frames and long_lost and self._bridge(image.stamp_ns) is None
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
         if solution.reason:
             tracks, solution = self._search(image, images)
