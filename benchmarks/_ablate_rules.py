@@ -150,7 +150,7 @@ RULES = (
     _rule(
         "steady motion",
         TRACKER,
-        "None if bridged else self._recovery.motion.steady(image.stamp_ns)",
+        "self._recovery.motion.steady(image.stamp_ns) if bridge is None else None",
         "None",
     ),
     _rule("other motions are tried", RECOVERY, "if self.free and expected.sigma_m > UNCERTAIN_M:", "if False:"),
@@ -175,7 +175,7 @@ RULES = (
         "if self._held is None or self._in_view(image, later) >= self._in_view(self._held, later):",
         "if True:",
     ),
-    _rule("more reference points", TRACKER, "        self._hold_more()\n        expected", "        expected"),
+    _rule("more reference points", TRACKER, "        self._hold_more()\n        bridge", "        bridge"),
     _rule(
         "recall by distance from the prediction",
         RECOVERY,

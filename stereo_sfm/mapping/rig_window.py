@@ -85,9 +85,7 @@ class RigWindow:
     information: RigInformation
     noise_px: float
     length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
-    turn: (
-        F64  # (3,) radians from the first to the last keyframe, zero where the same lenses saw what it is measured with
-    )
+    turn: F64  # (3,) radians from the first to the last keyframe
 
     def turned(self, change: F64) -> RigWindow:
         """If the rig's terms had been others, by `change` (8,)."""

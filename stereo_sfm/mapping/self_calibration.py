@@ -80,7 +80,7 @@ class SelfCalibration:
         self.terms: F64 = np.zeros(RIG_TERMS)  # current corrections
         self._corrected = np.zeros(RIG_TERMS, bool)
         self._keyframes: list[SeenPoints] = []
-        self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
+        self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # of the rig as it is now turned
         self._since = 0  # first keyframe of the windows
         self._stamp_ns = 0  # newest keyframe
         self._revised_ns = 0  # newest keyframe of the last revision
@@ -103,11 +103,10 @@ class SelfCalibration:
         turned = self._sudden_turn(keyframe)
         if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
-        if not self._keyframes or _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width):
+        moved = not self._keyframes or _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width)
+        if moved:
             self._keyframes.append(seen)
-        elif turned is None:
-            return None
-        if turned is not None or self._turned_kf_id >= 0:
+        if not moved or turned is not None or self._turned_kf_id >= 0:
             return turned
         if len(self._keyframes) == FIRST_KEYFRAMES and not (self.windows or self._corrected.any()):
             return self._at_first_sight()

@@ -111,7 +111,7 @@ class Movers:
         0 where fewer than `least` of their nearest neighbours move, or lost their points while they came nearer; else
         those neighbours' mean.
         """
-        if not (len(self._rho) or tracks.moving.any()):
+        if not (len(self._rho) or tracks.disagreed.any()):
             return np.zeros(len(uv), np.int32)
         among_uv, among_rho = np.concatenate([tracks.uv, self._uv]), np.concatenate([tracks.rho, self._rho])
         frames = np.where(tracks.disagreed, tracks.misses, 0)

@@ -411,17 +411,16 @@ class Tracker:
         """Pose (4, 4) and covariance (6, 6) by IMU and wheels since the last good pose; None if not accurate enough."""
         return None if self._sensors is None else self._sensors.bridge(stamp_ns)
 
-    def _expect(self, stamp_ns: int) -> Expectation:
+    def _expect(self, stamp_ns: int, bridge: tuple[F64, F64] | None) -> Expectation:
         """The predicted pose of a lost camera: by IMU and wheels, else by the last trusted motion."""
-        bridge = self._bridge(stamp_ns)
         return self._recovery.motion.expect(stamp_ns) if bridge is None else Expectation.of(*bridge)
 
     def _search(self, image: StereoImage, images: StereoPyramids) -> tuple[Tracks, PoseSolution]:
         """Relocalize a lost camera with the points of the last trusted image, from several hypotheses of its pose."""
         self._hold_more()
-        expected = self._expect(image.stamp_ns)
-        bridged = self._bridge(image.stamp_ns) is not None
-        steady = None if bridged else self._recovery.motion.steady(image.stamp_ns)
+        bridge = self._bridge(image.stamp_ns)
+        expected = self._expect(image.stamp_ns, bridge)
+        steady = self._recovery.motion.steady(image.stamp_ns) if bridge is None else None
         seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
         tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
@@ -503,9 +502,9 @@ class Tracker:
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
         """Predict the pose; after some time with a free view start a new submap."""
-        expected = self._expect(image.stamp_ns)
-        self._follower.search_widely()
         bridge = self._bridge(image.stamp_ns)
+        expected = self._expect(image.stamp_ns, bridge)
+        self._follower.search_widely()
         dark = image.left.max() < DARK
         if self._loss.add(image.stamp_ns, self._stamp_ns, bridge is None or not dark, self._recovery.free):
             self._pose = expected.odom_T_cam
