@@ -16,10 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.maps.floor import floor_level
 from stereo_sfm.types import F64, Keyframe
 
-STEP_M, STEP_RAD = (
-    0.5,
-    0.2,
-)  # between two keyframes that are compared: long against the odometry's errors of millimetres
+STEP_M, STEP_RAD = 0.5, 0.2  # between keyframes that are compared: long against errors of millimetres
 MIN_STEPS, MOST_STEPS = 10, 1000  # from which their scatter is known; that are kept
 UPRIGHT_RAD = np.deg2rad(5.0)  # standard deviation of a roll about which nothing is known: cameras are mounted by eye
 LARGEST_RAD = np.deg2rad(60.0)  # beyond that the camera does not stand upright: up and down may be confused
@@ -85,6 +82,11 @@ class MountingEstimate:
         self._before: Keyframe | None = None
         self._turns, self._moves = list[F64](), list[F64]()
         self._points: list[F64] = []
+
+    @property
+    def steps(self) -> int:
+        """How many pairs of keyframes it has."""
+        return len(self._moves)
 
     def add(self, keyframe: Keyframe) -> bool:
         """Take a keyframe; whether it says more than those before."""

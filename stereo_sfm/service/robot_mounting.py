@@ -27,22 +27,24 @@ class RobotMounting:
         self._rig: Rig | None = None
         self._told = False  # the measured tilt is in use
         self._best = np.inf  # its standard deviation when it was written last
+        self._due = 0  # steps of the drive at which it is measured next
 
     def begin(self, rig: Rig, folder: Path | None) -> Rig:
         """The calibration of a new session, with the kept tilt. Args: folder, of the map; None: nothing is kept."""
         self._estimate = MountingEstimate() if unknown(rig) else None
         self._file = None if folder is None else folder.with_name(f"{folder.name}.rig.yaml")
         kept = self._kept(rig) if self._estimate is not None else None
-        self._rig, self._told, self._best = rig, kept is not None, np.inf
+        self._rig, self._told, self._best, self._due = rig, kept is not None, np.inf, 0
         return rig if kept is None else kept
 
     def keyframe(self, keyframe: Keyframe) -> Rig | None:
         """Take a keyframe; the calibration with the tilt once that is measured for the first time."""
         if self._estimate is None or self._rig is None or not self._estimate.add(keyframe):
             return None
-        found = self._estimate.result()
+        found = self._estimate.result() if self._estimate.steps >= self._due else None
         if found is None or not found.measured:
             return None
+        self._due = 2 * self._estimate.steps  # halved deviations need more than twice as many
         rig = mounted(self._rig, found)
         if found.pitch_sigma_deg + found.roll_sigma_deg < 0.5 * self._best:
             self._best = found.pitch_sigma_deg + found.roll_sigma_deg
