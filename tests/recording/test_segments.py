@@ -267,7 +267,8 @@ def test_the_quota_is_kept_to_a_segment_however_fast_they_follow(
 def test_a_full_disk_costs_images_and_no_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "EVERY_S", 0.02)
     free = [int(90 * GB)]
-    recorder = start(tmp_path, lambda _: Disk(int(100 * GB), free[0]), quota=Quota(10 * GB, min_free=GB))
+    full = {"quota": Quota(10 * GB, min_free=GB), "segment_s": 60.0}  # ended segments' images go to make room
+    recorder = start(tmp_path, lambda _: Disk(int(100 * GB), free[0]), **full)
     images = list(SlidingWall(90))
     images = [replace(i, imu=ImuSamples(np.array([i.stamp_ns]), np.zeros((1, 3)), np.ones((1, 3)))) for i in images]
     record(recorder, images[:30])

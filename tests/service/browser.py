@@ -71,9 +71,9 @@ class Browser:
         return found["result"].get("value")
 
     def until(self, script: str, seconds: float = 20) -> Any:
-        """Wait for an expression to be true."""
+        """Wait for an expression to be true. One that raises is not true yet: its page is still loading."""
         end = time.monotonic() + seconds
-        while not (value := self.run(script)):
+        while not (value := self.run(f"(async () => ({script}))().catch(() => false)")):
             assert time.monotonic() < end, (
                 f"never true: {script}; the page shows: {self.run('document.body.innerText')}"
             )
