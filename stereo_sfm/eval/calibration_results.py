@@ -13,6 +13,7 @@ from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.calib.wheel_fit import NAMES as WHEEL_NAMES
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.maps.mounting import Mounting, mounted
+from stereo_sfm.tracking.flow.sudden_turn import SUSPECTED
 from stereo_sfm.types import CalibrationUpdate, SensorUpdate
 
 CORRECTED = "rig_corrected.yaml"
@@ -34,6 +35,13 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
         }
         for c in record.calibrations
     ]
+
+
+def suspicion_stats(record: RunRecord) -> list[dict[str, Any]]:
+    """Each sudden rotation of the right camera that was suspected, and each that did not stay."""
+    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    news = [(stamp_ns, text) for stamp_ns, text in record.news if text.startswith(SUSPECTED)]
+    return [{"seconds": (stamp_ns - first_ns) * 1e-9, "text": text} for stamp_ns, text in news]
 
 
 def start_check_stats(record: RunRecord) -> dict[str, Any] | None:
@@ -111,7 +119,7 @@ def calibration_lines(stats: dict[str, Any]) -> list[str]:
         f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
         for c in stats["calibration"]
     ]
-    lines = [*begun, *off, *changes]
+    lines = [*begun, *off, *changes, *(f"{s['text']} ({s['seconds']:.1f} s)" for s in stats["suspected"])]
     compared = stats["sensor_calibration"]
     if compared is None:
         return lines

@@ -112,7 +112,7 @@ class RunRecord:
     down: F64 = field(default_factory=lambda: np.zeros(3))  # gravity's direction in the map, zero: unknown
     down_information: float = 0.0  # 1/rad^2, summed over the keyframes
     sensor_use: dict[str, int] = field(default_factory=dict[str, int])  # by sensor, the last: a `SensorUse`
-    sensor_news: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # stamp_ns, why one is left out
+    news: list[tuple[int, str]] = field(default_factory=list[tuple[int, str]])  # stamp_ns, what sensors do
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     located_kf_id: int = -1  # first keyframe that was found in the saved map
     mounting: MountingEstimate = field(default_factory=MountingEstimate)  # the camera's tilt, if it is on a robot
@@ -174,7 +174,7 @@ class RunRecord:
         self.frames.add(frame)
         self.sensor_use |= {name: int(frame.stats[name]) for name in ("imu", "wheels") if name in frame.stats}
         if frame.reason and frame.state in (TrackState.OK, TrackState.RECOVERED):
-            self.sensor_news.append((frame.stamp_ns, frame.reason))
+            self.news.append((frame.stamp_ns, frame.reason))
 
     def _see(self, point_ids: I64) -> None:
         last = int(point_ids.max(initial=0))

@@ -21,7 +21,7 @@ def sensor_use_stats(record: RunRecord) -> dict[str, dict[str, Any]]:
     for name, code in record.sensor_use.items():
         out[name] = {"use": SensorUse(code).name.lower(), "seconds": None, "why": ""}
         word = {"imu": ("gyro", "accel", "imu"), "wheels": ("wheels",)}[name]
-        news = [(stamp_ns, text) for stamp_ns, text in record.sensor_news if text.startswith(word)]
+        news = [(stamp_ns, text) for stamp_ns, text in record.news if text.startswith(word)]
         if code <= SensorUse.MISSING and news:
             why = news[-1][1].partition(": ")
             out[name] |= {"seconds": (news[-1][0] - first_ns) * 1e-9, "why": f"{why[0].replace('_', ' ')}: {why[2]}"}

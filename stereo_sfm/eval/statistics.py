@@ -16,6 +16,7 @@ from stereo_sfm.eval.calibration_results import (
     row_error_stats,
     sensor_stats,
     start_check_stats,
+    suspicion_stats,
 )
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
@@ -94,6 +95,7 @@ def statistics(
         "warnings": list(record.warnings),
         "start_check": start_check_stats(record),
         "calibration": calibration_stats(record),
+        "suspected": suspicion_stats(record),
         "sensor_calibration": sensor_stats(record),
         "sensors": sensor_use_stats(record),
         "row_errors": row_error_stats(record),

@@ -19,7 +19,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
-from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
+from stereo_sfm.tracking.flow.sudden_turn import SUSPECTED, SuddenTurns
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, StereoImage, TrackState, Trajectory
 from tests.synthetic import fisheye_rig, pinhole_rig, turned
@@ -94,8 +94,10 @@ def test_a_camera_that_turns_back_or_on_has_not_turned_for_good(later: tuple[flo
     sequence = Sequence(RIGS["pinhole"])
     assert not any(sequence.see((0.0, 0.0, 0.0)) for _ in range(30))
     assert sequence.see((0.0, 0.1, 0.0)) and sequence.turns.turn.any()
+    assert "0.10 degrees" in sequence.turns.news() and not sequence.turns.news()
     assert not any(sequence.see((0.0, 0.1, 0.0)) for _ in range(3))
     assert sequence.see(later) and not sequence.turns.turn.any()
+    assert "did not stay so" in sequence.turns.news()
 
 
 def test_a_rotation_that_begins_during_an_exposure_is_one() -> None:
@@ -137,14 +139,17 @@ def wrong_steps(odometry: list[F64], truth: Trajectory) -> F64:
 def test_the_odometry_goes_on_before_the_map_knows(knocked: tuple[Rig, list[StereoImage], Trajectory]) -> None:
     rig, images, truth = knocked
     tracker = make_tracker(Config(), rig)
-    poses, turns = list[F64](), dict[int, F64]()
+    poses, reasons, turns = list[F64](), list[str](), dict[int, F64]()
     for image in images:
         frame, keyframe = tracker.step(image)
         assert frame.state == TrackState.OK
         poses.append(frame.odom_T_cam)
+        reasons.append(frame.reason)
         if keyframe is not None:
             turns[image.frame_id - images[0].frame_id] = keyframe.right_turn
             tracker.describe(keyframe)
+    assert {k: reason for k, reason in enumerate(reasons) if reason} == {AT: reasons[AT]}
+    assert reasons[AT].startswith(SUSPECTED)
     assert wrong_steps(poses, truth)[AT - 1 :].max() < 0.01
     assert not any(turn.any() for k, turn in turns.items() if k < AT)
     assert all(np.rad2deg(turn) == pytest.approx(KNOCK_DEG, abs=0.03) for k, turn in turns.items() if k >= AT)

@@ -184,7 +184,8 @@ class Tracker:
                 self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
         stats |= {} if self._sensors is None else self._sensors.level(self._pose) | self._sensors.use_of_each()
-        reason = "" if self._sensors is None else self._sensors.news()
+        news = (watched.news() for watched in (self._sudden, self._sensors) if watched is not None)
+        reason = next(filter(None, news), "")
         return self._frame(image, self._pose, solution.covariance, state, reason, inlier, keyframe, stats), keyframe
 
     def describe(self, keyframe: Keyframe) -> Keyframe:
