@@ -11,11 +11,10 @@ not run again, so an interrupted benchmark goes on, and commits with the same co
 folder that several checkouts may share.
 
 The sequences, what must hold of them and how they are laid out is in `_real_sequences.py`. A start is the sequence from
-some frame on; `--starts N` takes the first N of each. What did nothing in the default run is not switched off in another
-one: the result is the same. Switches: default, self-calibration, steps (sudden changes of the
-rig), people (motions other than the camera's), inertial, side views, recovery, loops. `--steps` also runs sequences
-whose right camera turns by 0.1 to 0.5 degrees in the middle (right images warped), so that nothing is won by not
-looking.
+some frame on; `--starts N` takes the first N of each. What did nothing in the default run is not switched off in a run
+of its own: the result is the same. Switches: default, self-calibration, steps (sudden changes of the rig), people
+(motions other than the camera's), inertial, side views, recovery, loops. `--steps` also runs sequences whose right
+camera turns by 0.1 to 0.5 degrees in the middle (right images warped), so that nothing is won by not looking.
 """
 
 from __future__ import annotations
