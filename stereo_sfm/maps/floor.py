@@ -9,7 +9,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.dominant_direction import dominant_direction
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import F64, Bool
 
 LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot

@@ -15,7 +15,7 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap, joined, restore_map
 from stereo_sfm.types import I64, LoopResult
 

@@ -12,7 +12,7 @@ import numpy as np
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.columns import COLUMNS
 from stereo_sfm.maps.joining import ends, join
 from stereo_sfm.maps.saved_map import SavedMap

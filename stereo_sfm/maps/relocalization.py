@@ -29,7 +29,7 @@ from stereo_sfm.loop.sideways import (
 )
 from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place

@@ -19,7 +19,8 @@ from stereo_sfm.calib.formats.native import read_native, rig_to_text, write_nati
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
-from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.cameras import MapCamera, cameras_text, difference, read_cameras, unified
 from stereo_sfm.maps.columns import COLUMNS, KEYS, check_columns
 from stereo_sfm.maps.header import (

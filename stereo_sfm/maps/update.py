@@ -17,7 +17,7 @@ from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.joining import join
 from stereo_sfm.maps.merge import share_a_session, subset
 from stereo_sfm.maps.saved_map import SavedMap
