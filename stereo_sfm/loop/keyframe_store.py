@@ -95,7 +95,7 @@ class KeyframeStore:
         first, count = self._rows.pop(kf_id)
         rows, table = np.arange(first, first + count), self._sightings
         map_kernels.unlink(rows[table.point[rows] >= 0], self._lists)
-        if len(table) > 2 * sum(count for _, count in self._rows.values()) + 4096:
+        if table.much_unused(sum(count for _, count in self._rows.values())):
             self._compact()
 
     def _compact(self) -> None:

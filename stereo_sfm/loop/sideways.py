@@ -13,6 +13,7 @@ import numpy as np
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Keyframe
 
 MIN_CORNERS = 20  # corners of a keyframe with which a search is worth it
@@ -54,24 +55,18 @@ def front_of(keyframe: Keyframe) -> F64:
     return points[np.linspace(0, len(points) - 1, SAMPLES).astype(int)].astype(np.float64)
 
 
-class Fronts:
+class Fronts(Columns):
     """What the views of keyframes show, one row each."""
 
+    points: F64 = column(np.float64, np.nan, (SAMPLES, 3))  # in the keyframe's camera; NaN without views
+
     def __init__(self, camera: Camera) -> None:
+        super().__init__()
         self._camera = camera
-        self._points: F64 = np.empty((64, SAMPLES, 3))  # in the keyframe's camera; NaN without views
-        self._count = 0
 
     def add(self, keyframe: Keyframe) -> None:
         """Remember the newest keyframe."""
-        if self._count == len(self._points):
-            self._points = np.concatenate([self._points, np.empty((max(self._count, 64), SAMPLES, 3))])
-        self._points[self._count] = front_of(keyframe)
-        self._count += 1
-
-    def keep(self, rows: I64) -> None:
-        """Only these rows stay, in this order."""
-        self._points, self._count = self._points[rows], len(rows)
+        self.append(1, points=front_of(keyframe))
 
     def turned(self, front: F64, cam_T_kf: F64) -> I64:
         """Rows whose views overlap with a camera's from another direction, those that should look most alike first.
@@ -83,7 +78,7 @@ class Fronts:
         apart = np.linalg.norm(cam_T_kf[:, :3, 3], axis=1)
         reach = REACH * float(np.median(np.linalg.norm(front, axis=1)))
         rows = np.flatnonzero((cam_T_kf[:, 2, 2] < TURNED) & (apart < reach))
-        there, here = self._points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
+        there, here = self.points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
         back = se3.inverse(cam_T_kf[rows])
         overlap = (self._alike(cam_T_kf[rows], there) + self._alike(back, here)) / 2
         order = np.lexsort((rows, -overlap))

@@ -23,8 +23,6 @@ from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F64, I64, U8, Corners, Keyframe
 
-FEW_KEYFRAMES = 256  # forgotten ones whose rows are not worth to be freed
-
 
 @dataclass(frozen=True, eq=False)
 class MapDelta:
@@ -338,9 +336,8 @@ class Map:
 
     @property
     def many_forgotten(self) -> bool:
-        """Whether a fifth of the rows of keyframes, and not only a few, are of culled ones that nothing names."""
-        table = self.keyframes
-        return int((table.alive | table.named).sum()) < 0.8 * len(table) - FEW_KEYFRAMES
+        """Whether many rows of keyframes are of culled ones that nothing names."""
+        return self.keyframes.much_unused(int((self.keyframes.alive | self.keyframes.named).sum()))
 
     def free_keyframes(self) -> I64:
         """Free the rows of culled keyframes that nothing names; the order of the others stays.
@@ -368,10 +365,10 @@ class Map:
 
     @property
     def much_removed(self) -> bool:
-        """Whether a fifth of the rows of points or observations, and not only a few, are unused."""
+        """Whether many rows of points or observations are unused."""
         living = self.points.alive
         seen = int(self.points.obs_count[living].sum())
-        return len(living) > 1.25 * int(living.sum()) + 512 or len(self.observations) > 1.25 * seen + 4096
+        return self.points.much_unused(int(living.sum())) or self.observations.much_unused(seen)
 
     def compact(self, followed: I64 | None = None) -> I64:
         """Free the rows of removed points and observations; the order of the others stays.
