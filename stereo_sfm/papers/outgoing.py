@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.tracking.descriptors import describe
-from stereo_sfm.tracking.features.feature_view import FeatureView
 from stereo_sfm.types import F64, Keyframe, Observations
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.essential import relative_pose
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
+from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 
 _MIN_SCALED = 5
 

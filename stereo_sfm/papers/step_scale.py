@@ -8,7 +8,7 @@ import numpy as np
 
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.tracking.features.motion_estimator import Motion
+from stereo_sfm.papers.motion_estimator import Motion
 from stereo_sfm.types import Trajectory
 
 SCALES = ("stereo", "unit", "ground-truth")

@@ -18,7 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import rotation_between
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.vanishing import Manhattan, nearest_turn
-from stereo_sfm.tracking.manhattan import ManhattanCompass
+from stereo_sfm.papers.manhattan import ManhattanCompass
 from stereo_sfm.tracking.protocol import AnyTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 

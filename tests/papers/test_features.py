@@ -9,8 +9,8 @@ import pytest
 from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.features.extraction import TABLE, Extractor, circle_mask, feature_kind
-from stereo_sfm.tracking.features.matching import _two_nearest, epipolar_inliers, match_features
+from stereo_sfm.papers.extraction import TABLE, Extractor, circle_mask, feature_kind
+from stereo_sfm.papers.matching import _two_nearest, epipolar_inliers, match_features
 from stereo_sfm.types import F64, U8
 
 SHIFT = np.array([7.0, -3.0])

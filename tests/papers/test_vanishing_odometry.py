@@ -14,11 +14,11 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.vanishing import nearest_turn
-from stereo_sfm.tracking.features.motion_estimator import FramePair
-from stereo_sfm.tracking.features.odometry.vp_r import VpR
-from stereo_sfm.tracking.manhattan import ManhattanCompass
+from stereo_sfm.papers.manhattan import ManhattanCompass
+from stereo_sfm.papers.motion_estimator import FramePair
+from stereo_sfm.papers.odometry.vp_r import VpR
 from stereo_sfm.types import F64, U8
-from tests.tracking.synthetic_views import frame_pair
+from tests.papers.synthetic_views import frame_pair
 
 
 def orientations(spec: str) -> tuple[list[F64], list[F64], list[F64]]:

@@ -6,11 +6,11 @@ import numpy as np
 
 from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.geometry.motion_only import bearing_errors
-from stereo_sfm.tracking.features.extraction import feature_kind
-from stereo_sfm.tracking.features.feature_view import FeatureView
-from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
-from stereo_sfm.tracking.features.motion_estimator import FramePair
-from stereo_sfm.tracking.features.point_ids import PointIds
+from stereo_sfm.papers.extraction import feature_kind
+from stereo_sfm.papers.feature_view import FeatureView
+from stereo_sfm.papers.matching import epipolar_inliers, match_features
+from stereo_sfm.papers.motion_estimator import FramePair
+from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.types import F64, I64
 
 _RECOVER_PX = 4.0  # how near a keyframe's point must reproject to be taken for the same point

@@ -16,7 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, refine_pose
 from stereo_sfm.geometry.procrustes import refuse_line
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
+from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 from stereo_sfm.types import F64, Bool
 
 _PLANE_LIMIT = np.cos(np.radians(70.0))

@@ -8,9 +8,9 @@ from typing import cast
 import numpy as np
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.features.extraction import Features
-from stereo_sfm.tracking.features.feature_view import FeatureView
-from stereo_sfm.tracking.features.point_ids import PointIds
+from stereo_sfm.papers.extraction import Features
+from stereo_sfm.papers.feature_view import FeatureView
+from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.types import F32, F64, I64, U8, MapUpdate
 
 

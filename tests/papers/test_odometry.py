@@ -13,11 +13,11 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.estimators import estimator, make_estimator
-from stereo_sfm.tracking.features.motion_estimator import FramePair, Motion
-from stereo_sfm.tracking.features.step_scale import StepScale
+from stereo_sfm.papers.estimators import estimator, make_estimator
+from stereo_sfm.papers.motion_estimator import FramePair, Motion
+from stereo_sfm.papers.step_scale import StepScale
 from stereo_sfm.types import F64, Trajectory
-from tests.tracking.synthetic_views import PIXEL, frame_pair, unit
+from tests.papers.synthetic_views import PIXEL, frame_pair, unit
 
 CAMERA = Pinhole(640, 480, 400.0, 400.0, 319.5, 239.5)
 MOTION = se3.exp(np.array([0.05, -0.02, -0.2, 0.01, 0.03, -0.01]))
@@ -185,7 +185,7 @@ def test_wrong_names_are_one_clear_line() -> None:
 
 def test_a_file_in_the_folder_is_an_estimator() -> None:
     """One new file and no edit: the folder is the table."""
-    import stereo_sfm.tracking.features.odometry as folder
+    import stereo_sfm.papers.odometry as folder
 
     own = Path(folder.__path__[0])
     assert set(estimator_names()) == {p.stem.replace("_", "-") for p in own.glob("[a-z]*.py")}

@@ -12,9 +12,9 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.vanishing import Manhattan
+from stereo_sfm.papers.manhattan_prior import ManhattanTracker, RotationFilter
 from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.presets import preset
-from stereo_sfm.tracking.manhattan_prior import ManhattanTracker, RotationFilter
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState, Trajectory
 from tests.synthetic import pinhole_rig
 

@@ -12,9 +12,9 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.vanishing import Manhattan, ManhattanLimits
-from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
-from stereo_sfm.tracking.features.odometry._translation import translation_for
-from stereo_sfm.tracking.manhattan import ManhattanCompass
+from stereo_sfm.papers.manhattan import ManhattanCompass
+from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
+from stereo_sfm.papers.odometry._translation import translation_for
 from stereo_sfm.types import U8
 
 

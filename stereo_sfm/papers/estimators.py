@@ -7,7 +7,7 @@ import importlib
 from stereo_sfm.config import OdometryConfig, estimator_names
 from stereo_sfm.errors import one_of
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.tracking.features.motion_estimator import Estimator, EstimatorEntry
+from stereo_sfm.papers.motion_estimator import Estimator, EstimatorEntry
 
 
 def estimator(name: str) -> EstimatorEntry:
@@ -17,7 +17,7 @@ def estimator(name: str) -> EstimatorEntry:
         StereoSfmError: unknown name.
     """
     one_of(name, ("flow", *estimator_names()), "odometry")
-    return importlib.import_module(f"stereo_sfm.tracking.features.odometry.{name.replace('-', '_')}").ESTIMATOR
+    return importlib.import_module(f"stereo_sfm.papers.odometry.{name.replace('-', '_')}").ESTIMATOR
 
 
 def make_estimator(config: OdometryConfig, camera: Camera) -> Estimator:

@@ -16,9 +16,9 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
+from stereo_sfm.papers.feature_tracker import FeatureTracker
 from stereo_sfm.presets import PRESETS, preset
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.tracking.features.feature_tracker import FeatureTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
 
 SPEC = "sim:aisle?camera=pinhole&frames=7&size=480x300"

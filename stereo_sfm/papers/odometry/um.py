@@ -8,7 +8,7 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import refuse_line, rigid
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion, refuse_chance, weights
+from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion, refuse_chance, weights
 
 
 class Um:

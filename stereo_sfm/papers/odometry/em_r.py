@@ -6,8 +6,8 @@ import numpy as np
 
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.essential import relative_pose
-from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
-from stereo_sfm.tracking.features.odometry._translation import translation_for
+from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
+from stereo_sfm.papers.odometry._translation import translation_for
 
 
 class EmR:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.features.motion_estimator import FramePair
+from stereo_sfm.papers.motion_estimator import FramePair
 from stereo_sfm.types import F64
 
 PIXEL = 1.0 / 400.0

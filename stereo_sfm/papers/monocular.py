@@ -17,16 +17,16 @@ from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.papers.extraction import feature_kind
+from stereo_sfm.papers.feature_view import FeatureView, ViewMaker
+from stereo_sfm.papers.local_points import LocalPoints
+from stereo_sfm.papers.map_correction import KeyframePoses
+from stereo_sfm.papers.matching import epipolar_inliers, match_features
+from stereo_sfm.papers.monocular_start import MIN_MATCHES, MIN_PARALLAX_DEG, good_points, start_from
+from stereo_sfm.papers.odometry.pnp import pnp_pose
+from stereo_sfm.papers.outgoing import keyframe_of, observations_of
+from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.features.extraction import feature_kind
-from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
-from stereo_sfm.tracking.features.local_points import LocalPoints
-from stereo_sfm.tracking.features.map_correction import KeyframePoses
-from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
-from stereo_sfm.tracking.features.monocular_start import MIN_MATCHES, MIN_PARALLAX_DEG, good_points, start_from
-from stereo_sfm.tracking.features.odometry.pnp import pnp_pose
-from stereo_sfm.tracking.features.outgoing import keyframe_of, observations_of
-from stereo_sfm.tracking.features.point_ids import PointIds
 from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner

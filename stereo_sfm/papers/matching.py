@@ -9,7 +9,7 @@ import numpy as np
 
 from stereo_sfm.geometry.essential import essential_ransac
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.extraction import Features
+from stereo_sfm.papers.extraction import Features
 from stereo_sfm.types import F64, I64, U8, Bool
 
 _PINHOLE_LIMIT = np.cos(np.radians(70.0))  # bearings further from the axis are not put on an image plane

@@ -8,7 +8,7 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import refuse_line, rigid, rigid_ransac
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.motion_estimator import (
+from stereo_sfm.papers.motion_estimator import (
     EstimatorEntry,
     FramePair,
     Motion,

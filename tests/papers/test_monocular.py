@@ -13,13 +13,13 @@ from stereo_sfm.geometry.homography import PLANAR_RATIO, homographies, homograph
 from stereo_sfm.geometry.motion_only import refine_pose
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.two_view import essential_from_motion
-from stereo_sfm.tracking.features.extraction import Features
-from stereo_sfm.tracking.features.feature_view import FeatureView
-from stereo_sfm.tracking.features.local_points import LocalPoints, row_of
-from stereo_sfm.tracking.features.monocular_start import TwoViewStart, good_points, start_from
-from stereo_sfm.tracking.features.point_ids import PointIds
+from stereo_sfm.papers.extraction import Features
+from stereo_sfm.papers.feature_view import FeatureView
+from stereo_sfm.papers.local_points import LocalPoints, row_of
+from stereo_sfm.papers.monocular_start import TwoViewStart, good_points, start_from
+from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.types import F64, MapUpdate
-from tests.tracking.synthetic_views import PIXEL, unit
+from tests.papers.synthetic_views import PIXEL, unit
 
 CONFIG = OdometryConfig(method="pnp")
 MOTION = se3.exp(np.array([-0.5, 0.05, 0.1, 0.01, 0.04, -0.02]))  # second_T_first

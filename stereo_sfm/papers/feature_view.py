@@ -12,9 +12,9 @@ from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.stereo import triangulate
 from stereo_sfm.geometry.two_view import epipolar_residuals, essential_from_motion
+from stereo_sfm.papers.extraction import Extractor, Features, feature_kind
+from stereo_sfm.papers.matching import epipolar_inliers, match_features
 from stereo_sfm.tracking.depth_image import points_from_depth
-from stereo_sfm.tracking.features.extraction import Extractor, Features, feature_kind
-from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
 from stereo_sfm.types import F64, I32, I64, U8, Bool, Message, StereoImage
 
 MIN_DISPARITY_PX = 0.5  # below, the depth is treated as unknown

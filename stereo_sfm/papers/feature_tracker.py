@@ -16,16 +16,16 @@ from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.papers.estimators import make_estimator
+from stereo_sfm.papers.extraction import circle_mask
+from stereo_sfm.papers.feature_view import FeatureView, ViewMaker
+from stereo_sfm.papers.map_correction import KeyframePoses
+from stereo_sfm.papers.motion_estimator import Motion
+from stereo_sfm.papers.outgoing import keyframe_of, observations_of
+from stereo_sfm.papers.pairing import Pairing
+from stereo_sfm.papers.point_ids import PointIds
+from stereo_sfm.papers.step_scale import StepScale
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.features.estimators import make_estimator
-from stereo_sfm.tracking.features.extraction import circle_mask
-from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
-from stereo_sfm.tracking.features.map_correction import KeyframePoses
-from stereo_sfm.tracking.features.motion_estimator import Motion
-from stereo_sfm.tracking.features.outgoing import keyframe_of, observations_of
-from stereo_sfm.tracking.features.pairing import Pairing
-from stereo_sfm.tracking.features.point_ids import PointIds
-from stereo_sfm.tracking.features.step_scale import StepScale
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.types import (
     F64,

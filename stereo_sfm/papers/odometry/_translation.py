@@ -7,7 +7,7 @@ import numpy as np
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.procrustes import translation_ransac
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.motion_estimator import FramePair, thresholds, weights
+from stereo_sfm.papers.motion_estimator import FramePair, thresholds, weights
 from stereo_sfm.types import F64, Bool
 
 

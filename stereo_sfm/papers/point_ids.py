@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereo_sfm.tracking.features.feature_view import FeatureView
+from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.types import I64, Bool
 
 
