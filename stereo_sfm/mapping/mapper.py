@@ -201,11 +201,8 @@ class Mapper(AnyMapper):
         return self._update(int(self.map.keyframes.kf_id[-1]))
 
     def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
-        none = np.zeros(0, np.int64)
-        return MapUpdate(
-            self._version, keyframe.kf_id, np.array([keyframe.kf_id]), np.array([keyframe.odom_T_cam]), none,
-            np.zeros((0, 3)), none, np.zeros((0, 2), np.int64), np.eye(4), sensors=self._sensor_update,
-        )  # fmt: skip
+        kf_id, pose = keyframe.kf_id, keyframe.odom_T_cam
+        return MapUpdate(self._version, kf_id, np.array([kf_id]), np.array([pose]), sensors=self._sensor_update)
 
     def _update(self, kf_id: int) -> MapUpdate:
         delta = self.map.take_delta()

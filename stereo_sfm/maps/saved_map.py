@@ -267,15 +267,5 @@ def joined(maps: list[SavedMap]) -> SavedMap:
 
 def as_update(saved: SavedMap) -> MapUpdate:
     """A whole map as one message of the mapper."""
-    s, none = saved.snapshot, np.zeros(0, np.int64)
-    return MapUpdate(
-        version=1,
-        kf_id=int(s.kf_ids[-1]),
-        kf_ids=s.kf_ids.copy(),
-        map_T_kf=s.map_T_kf.copy(),
-        point_ids=s.pt_ids.copy(),
-        points_map=s.points.copy(),
-        culled_point_ids=none,
-        fused_point_ids=np.zeros((0, 2), np.int64),
-        map_T_odom=np.eye(4),
-    )
+    s = saved.snapshot
+    return MapUpdate(1, int(s.kf_ids[-1]), s.kf_ids.copy(), s.map_T_kf.copy(), s.pt_ids.copy(), s.points.copy())
