@@ -387,12 +387,12 @@ class Mapper(AnyMapper):
 
     def _insert(self, keyframe: Keyframe) -> int:
         guess = self._map_T_odom @ keyframe.odom_T_cam
-        insertion = insert_keyframe(self.map, self.rig, keyframe, guess, self._config)
-        self._fused += insertion.fused
+        row, fused = insert_keyframe(self.map, self.rig, keyframe, guess, self._config)
+        self._fused += fused
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):
             self._follow_newest(guess)  # what the rig before it measured since the last keyframe is wrong
             self._rig_terms = keyframe.rig_terms
-        return insertion.row
+        return row
 
     def _adjust(self, row: int) -> None:
         if row == 0:
