@@ -16,7 +16,7 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.cloud import Cloud, gather
-from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
@@ -230,18 +230,11 @@ class LoopCloser:
         reference = pick((scores[self._row[k]] for k in connected), default=0.0)
         bound = max(config.score_ratio * reference, config.min_score)
         excluded = self._near(keyframe.kf_id, connected)
-        ids = self._database.kf_ids
-        good = [i for i in np.flatnonzero(scores > bound).tolist() if int(ids[i]) in self._store]
-        good = [i for i in good if int(ids[i]) not in excluded]
-        good.sort(key=lambda i: (-scores[i], i))
-        places: list[int] = []
-        if config.proximity:
-            places += self._graph.nearby(keyframe.kf_id, excluded)
-        wanted = config.max_candidates + len(places)
-        for i in good:
-            kf_id = int(ids[i])
-            if len(places) < wanted and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
-                places.append(kf_id)
+        good = np.flatnonzero(scores > bound)
+        good = self._database.kf_ids[good[np.argsort(-scores[good], kind="stable")]].tolist()
+        near = self._graph.nearby(keyframe.kf_id, excluded) if config.proximity else []
+        free = (k for k in good if k in self._store and k not in excluded)
+        places = apart(free, PLACE_RADIUS, config.max_candidates + len(near), near)
         found = [Candidate(k, float(scores[self._row[k]])) for k in places]
         return found + self._side_candidates(keyframe, side_bag, excluded), "no_candidate"
 
@@ -263,14 +256,12 @@ class LoopCloser:
         turned = graph_ids[self._fronts.turned(front_of(keyframe), cam_T_kf)].tolist()
         places = [k for k in turned if k in self._store and k not in excluded][:1]
         wanted = 2 if places else self._config.max_candidates
-        ids = self._side_database.kf_ids
-        for i in np.lexsort((np.arange(len(scores)), -with_neighbours(scores))).tolist():
-            if pauses or len(places) == wanted or scores[i] < self._config.min_score:
-                break
-            kf_id = int(ids[i])
-            free = kf_id in self._store and kf_id not in excluded
-            if free and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
-                places.append(kf_id)
+        if not pauses:
+            best = np.argsort(-with_neighbours(scores), kind="stable")
+            good = best[np.logical_and.accumulate(scores[best] >= self._config.min_score)]
+            ids = self._side_database.kf_ids[good].tolist()
+            free = (k for k in ids if k in self._store and k not in excluded)
+            places = apart(free, PLACE_RADIUS, wanted, places)
         return [Candidate(k, float(scores[self._row[k]]), True) for k in places]
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:

@@ -7,6 +7,8 @@ A query reads the whole table, a millisecond for some thousand keyframes: less t
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit
@@ -61,6 +63,15 @@ class PlaceDatabase:
         _add_minima(self._asked, self._words.keyframe, self._words.word, self._words.weight, scores)
         self._asked[bag.words] = 0.0
         return scores
+
+
+def apart(ids: Iterable[int], radius: int, most: int, chosen: Sequence[int] = ()) -> list[int]:
+    """The chosen ids and the first of the others, `most` in all, that are more than `radius` from all before them."""
+    out = list(chosen)
+    for k in ids:
+        if len(out) < most and all(abs(k - other) > radius for other in out):
+            out.append(k)
+    return out
 
 
 @njit

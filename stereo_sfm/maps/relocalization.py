@@ -15,7 +15,7 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
-from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.other_camera import widest
 from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
@@ -309,13 +309,9 @@ class Relocalizer:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
         together = np.zeros(len(scores))
         together[self._described] = with_neighbours(scores[self._described])
-        chosen: list[int] = []
-        for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
-            if len(chosen) == self.config.relocalize_candidates or scores[row] <= 0:
-                break
-            if all(abs(row - other) > 2 for other in chosen):
-                chosen.append(row)
-        return chosen
+        best = np.argsort(-together, kind="stable")
+        scored = best[np.logical_and.accumulate(scores[best] > 0)]
+        return apart(scored.tolist(), 2, self.config.relocalize_candidates)
 
     def _nearest(self, guess: F64, count: int) -> I64:
         """Rows of the nearest keyframes, nearest first."""
