@@ -8,14 +8,10 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.association import find_again
-from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.map import POSE_POINTS, Map
 from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
-
-MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before insertion
-# With fewer that agree with it, odometry, which has all tracked points, knows the pose better than the map.
-FEW_POINTS = 30
 
 
 def insert_keyframe(
@@ -31,7 +27,8 @@ def insert_keyframe(
     """
     rows, usable = _identify(map_, keyframe, config)
     pose, agreeing = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
-    few = keyframe.odometry is not None and agreeing < FEW_POINTS
+    # Odometry, which has all tracked points, knows the pose better than few points of the map.
+    few = keyframe.odometry is not None and agreeing < 2 * config.connected_points
     pose = guess if few else pose
     row = map_.add_keyframe(keyframe, pose, Motion.of(keyframe, rig.imu, config.sensors, few))
     matches = np.zeros((0, 2), np.int64)
@@ -65,13 +62,13 @@ def _solve_pose(
     known = known.copy()
     known[known] = np.isfinite(map_.points.xyz[rows[known], 0])
     count = int(known.sum())
-    if count < MIN_POSE_POINTS:
+    if count < POSE_POINTS:
         return guess, 0
     rows = rows[known]
     points, uv_left, uv_right = map_.points, keyframe.uv_left[known], keyframe.uv_right[known]
     sigma = points.sigma[rows].astype(float)
     pose, inlier = adjust_pose(rig, guess, points.xyz[rows], uv_left, uv_right, sigma, config.huber_sigmas)
-    if inlier[:, 0].sum() < max(MIN_POSE_POINTS, count // 2):
+    if inlier[:, 0].sum() < max(POSE_POINTS, count // 2):
         return guess, 0
     return pose, int(np.count_nonzero(inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))))
 

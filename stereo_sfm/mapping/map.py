@@ -36,6 +36,9 @@ class MapDelta:
     xyz: F64  # (P, 3)
 
 
+POSE_POINTS = 10  # known points from which a keyframe's pose is solved, three times the least that determine one
+
+
 class Map:
     """Keyframes, points, observations."""
 

@@ -30,7 +30,8 @@ MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives
 NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
-LENGTHENING = 1, 5, 6, 7  # terms that trade lengths with one another: rotation about y, those of lenses
+LENSES = slice(5, 8)  # focal ratio and decentering
+LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these
 # Prior standard deviations of the terms: radians, radians, ratio, radians.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 

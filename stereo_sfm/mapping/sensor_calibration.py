@@ -27,7 +27,6 @@ BETTER = 0.7  # times the standard deviation of a corrected term: it is replaced
 # Standard deviations from which a term is known, and differences that are left: what images of half the size leave of a
 # true calibration (0.2 degrees about the vertical axis, which only small accelerations show, 0.5 ms), with room.
 IMU_KNOWN = np.append(np.full(3, np.radians(0.3)), 1e-3)
-IMU_LEFT = np.append(np.full(3, np.radians(0.3)), 1e-3)
 # Of `wheel_fit.NAMES`; their time offset stays: how a robot slides in turns looks like one of 15 ms.
 WHEEL_KNOWN = np.array([3e-3, 3e-3, 1e-2, np.radians(0.3), np.radians(0.3), 0.0, 0.03, 0.03])
 WHEEL_LEFT = np.array([5e-3, 5e-3, 3e-2, np.radians(1.0), np.radians(1.0), 0.0, 0.05, 0.05])
@@ -72,7 +71,7 @@ class SensorCalibration:
         self._rig = rig
         self._parts: deque[SensorSamples] = deque()
         self._submap_id = 0
-        self._imu, self._wheel = _Terms.of(3, IMU_KNOWN, IMU_LEFT), _Terms.of(1, WHEEL_KNOWN, WHEEL_LEFT)
+        self._imu, self._wheel = _Terms.of(3, IMU_KNOWN, IMU_KNOWN), _Terms.of(1, WHEEL_KNOWN, WHEEL_LEFT)
         self._due_ns = 0
 
     @staticmethod
