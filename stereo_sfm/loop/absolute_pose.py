@@ -15,11 +15,12 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.loop import p3p, pose_kernels
 from stereo_sfm.loop.p3p import Lens
 from stereo_sfm.types import F64, I64, Bool
 
-CHI2_2DOF_95 = 5.991
+CHI2_2DOF_95 = chi_squared(0.95, 2)  # sigmas^2, of a pixel beyond which a match disagrees
 DAMPING = 1e-9 * np.eye(6)  # m^-2, rad^-2: a direction of which nothing is known stays
 
 
