@@ -15,10 +15,11 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.types import F64, I64, Bool
 
 ROBUST = ("gnc", "switchable", "none")
-CHI2_6DOF_99 = 16.81
+CHI2_6DOF_99 = chi_squared(0.99, 6)  # sigmas^2, of a loop from which its weight falls below one
 HELD = 1e-6  # metres, radians: standard deviation of a pose that stays
 TILT = 0.05  # radians, that of its roll and pitch where gravity is known
 
