@@ -45,15 +45,18 @@ from stereo_sfm.mapping.culling import OF_A_VIEW, OF_EARLIER_VISITS, PASSED
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
-CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
-PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
+CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own: on both sides of it
+PLACE_RADIUS = (
+    3  # keyframes: candidates at most so many keyframes apart are one place: only the best of them is verified
+)
 KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the same of the share of corners of its best keyframe, where several found it
-LOOKALIKES = 3000  # hypotheses between sessions that are remembered
+LOOKALIKES = 3000  # hypotheses between sessions that are remembered: it bounds memory
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
-AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # largest difference of two keyframes' estimates of one loop
+# Largest difference of two keyframes' estimates of one loop: noise of both, and drift between them.
+AGREE_METRES, AGREE_DEGREES = 0.15, 2.0
 
 
 @dataclass(frozen=True)

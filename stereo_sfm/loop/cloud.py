@@ -19,7 +19,8 @@ from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
-SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # largest differences of one corner in two keyframes
+# Largest differences of one corner in two keyframes: of positions by stereo, of descriptors (as of points of the map).
+SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50
 CORNERS = 10**6  # more than a keyframe has: makes temporary ids of corners unique
 
 

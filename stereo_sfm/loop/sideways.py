@@ -16,8 +16,8 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Keyframe
 
-MIN_CORNERS = 20  # corners of a keyframe with which a search is worth it
-SAMPLES = 24  # corners of a keyframe that stand for what its views show
+MIN_CORNERS = 20  # of a keyframe with which a search is worth it: a loop across directions needs twice as many
+SAMPLES = 24  # corners of a keyframe that stand for what its views show: their overlap is a mean of them
 REACH = 2.0  # of a camera whose views may show the same fronts: in median distances of what its own show
 MIN_OVERLAP = 0.2  # of two keyframes' views, of at most 1
 SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it

@@ -20,8 +20,6 @@ from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
-MATCH_HUBER = 1.5  # sigmas where the loss of a match becomes linear
-
 
 def find_again(
     map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, usable: Bool, pose: F64, config: MapperConfig
@@ -94,8 +92,8 @@ def _agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, co
     none = np.zeros(count, bool)
     if count < config.match_min:
         return none
-    sigma = np.full(count, config.match_sigma_px)
-    _, inlier = adjust_pose(rig, map_T_kf, xyz, uv_left, uv_right, sigma, MATCH_HUBER)
+    sigma, huber = np.full(count, config.match_sigma_px), 2 * config.huber_sigmas  # without the bias of tracks at edges
+    _, inlier = adjust_pose(rig, map_T_kf, xyz, uv_left, uv_right, sigma, huber)
     good = inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
     if good.sum() < max(config.match_min, 0.5 * count):
         return none

@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 
 Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
 SPARE = 4  # one spare row for so many in use: rows are copied four times on the way, and little memory is unused
-FEW = 512  # rows that are not worth to be freed
+FEW = 512  # rows that are not worth to be freed: tens of kilobytes
 
 
 def column(dtype: DTypeLike, default: Any, shape: tuple[int, ...] = ()) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-HUBER = 2.0  # sigmas where the loss becomes linear
+HUBER = 2.0  # sigmas where the loss becomes linear: of one of twenty right ones
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,11 +70,11 @@ from stereo_sfm.types import (
     SensorUpdate,
 )
 
-MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
-FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
-GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
-LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
-RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
+MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment: more hold it
+FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment: fewer are within one window
+GROWTH_AT_KNOWN_LOOP = 1.1  # factor by which the map has grown when a known loop starts a full bundle adjustment
+LAG_SHARE = 0.1  # of the living keyframes, until a result is due: the time of a full adjustment grows with the map
+RECENT = 3  # newest keyframes, whose points are checked and which are never redundant: their points are still tracked
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ from stereo_sfm.types import F64, I64, Bool
 
 ROBUST = ("gnc", "switchable", "none")
 CHI2_6DOF_99 = chi_squared(0.99, 6)  # sigmas^2, of a loop from which its weight falls below one
-HELD = 1e-6  # metres, radians: standard deviation of a pose that stays
-TILT = 0.05  # radians, that of its roll and pitch where gravity is known
+HELD = 1e-6  # metres, radians: standard deviation of a pose that stays, far below that of any edge
+TILT = 0.05  # radians, that of its roll and pitch where gravity is known: far above gravity's
 
 
 @dataclass(frozen=True, eq=False)

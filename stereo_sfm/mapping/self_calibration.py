@@ -33,26 +33,29 @@ from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
 OF_ROTATION = np.arange(RIG_TERMS) < 3  # of the right camera
 KEYFRAMES = 4  # of one window, the last one may have one less; a rotation that the tracker noticed stays for as many
-MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
-MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
-MIN_WINDOWS = 2  # before the first correction
-FIRST_KEYFRAMES = 2  # from which a first error is corrected that both halves of their points show
-INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])  # windows that each term needs: in the order in which cameras err
+# Share of the image's width that common points move (median) between keyframes of a window: less says little.
+MIN_MOTION = 0.02
+MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case: near ones left the view
+MIN_WINDOWS = 2  # before the first correction: one for each half
+FIRST_KEYFRAMES = 2  # the fewest of a window: a first error is corrected that both halves of their points show
+# Windows that each term needs, in the order in which cameras err: rotation, baseline and focal length, decentering.
+INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
 # For halves of two windows each, twice as many for drift, of which two are unknown. As many as there are, but no more
 # than these, come from one revision to the next.
 ENOUGH_WINDOWS = 4
-MAX_WINDOWS = 80  # used, the newest
+MAX_WINDOWS = 80  # used, the newest: what changes slowly is followed
 # Of others, once the calibration is known to be wrong: Akaike's criterion, but for those by which cameras err least.
 FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [3, 4, 6, 7]), SIGMAS, np.sqrt(2.0))
 REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
+# Standard deviations, of one in 370 by chance and of one in 44 (one-sided):
 HUNTING_SIGMAS = 3.0  # by which a refinement moves a term that is taken back unless it is still significant
 HELPING_SIGMAS = 2.0  # by which a correction makes windows better that it was not estimated from
 MISLED_SHARE = 0.05  # of a rig's error that remains in what is estimated from points tracked with it
-MATCHING_PX = 0.02  # systematic error of matching, of all windows
+MATCHING_PX = 0.02  # px, systematic error of matching, which all windows share
 # Bias of the terms of lenses, px at the border over the noise of a pixel: distances are a nonlinear function of pixels.
 BIAS_SHARE = 0.5
-WINDOW_PX = 0.05  # that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
-DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: matching errors that depend on distance
+WINDOW_PX = 0.05  # px, that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
+DIRECTION = np.deg2rad(0.15)  # radians, systematic error of the baseline's direction: of matching, by distance
 
 
 @dataclass(frozen=True, eq=False)

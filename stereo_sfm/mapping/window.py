@@ -20,7 +20,7 @@ from stereo_sfm.mapping.map import POSE_POINTS, Map
 from stereo_sfm.mapping.motion_factors import motion_factors
 from stereo_sfm.types import F64, I64, Bool
 
-FINAL_ROUNDS = 4  # of the last full bundle adjustment, whose weights are to converge
+FINAL_ROUNDS = 4  # of the last full bundle adjustment, twice the usual: weights are to converge
 
 
 @dataclass(frozen=True, eq=False)

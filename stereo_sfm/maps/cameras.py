@@ -19,10 +19,11 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, RIG_TERMS
 
 KEY = "stereo_sfm_map_cameras"
-SAME_PX = 1e-3  # difference of focal lengths and principal points that is not worth a word
-SAME_SHARE = 1e-4  # of the baseline, likewise
-SAME_DEG = 1e-3  # likewise
-# What self-calibration may change of a rig: degrees, shares of the baseline and of the right focal length.
+# Differences that are not worth a word, below what any calibration knows: px of focal lengths and principal points,
+# share of the baseline, degrees.
+SAME_PX, SAME_SHARE, SAME_DEG = 1e-3, 1e-4, 1e-3
+# What self-calibration may change of a rig, about a standard deviation of its prior (`rig_window.PRIOR`): degrees,
+# shares of the baseline and of the right focal length.
 CORRECTED_DEG, CORRECTED_SHIFT, CORRECTED_FOCAL = 0.6, 0.02, 0.01
 
 

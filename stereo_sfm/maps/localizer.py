@@ -14,7 +14,7 @@ from stereo_sfm.mapping.self_calibration import SelfCalibration
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.types import F64, RIG_TERMS, CalibrationUpdate, Keyframe, LoopResult, MapUpdate
 
-LOST_AFTER = 5  # keyframes not found near the prediction before the whole map is searched
+LOST_AFTER = 5  # keyframes not found near the prediction, as beside people, before the whole map is searched
 
 
 class Localizer(AnyMapper):

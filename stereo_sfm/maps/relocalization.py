@@ -32,9 +32,9 @@ from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
-SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
+SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: lamps and products repeat at larger steps
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
-MIN_RANGE_SIGMA_M = 0.003
+MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
 SIDE_PLACES = 12  # of `relocalize_candidates` that are verified beside: no confident one ends that search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten

@@ -12,9 +12,10 @@ from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.extraction import Features
 from stereo_sfm.types import F64, I64, U8, Bool
 
-_PINHOLE_LIMIT = np.cos(np.radians(70.0))  # bearings further from the axis are not put on an image plane
-_MIN_FOR_RANSAC = 8
-_CHUNK = 1024  # rows of the distance table at once
+# Cosine of 70 degrees: bearings further from the axis are not put on an image plane, which stretches nine times there.
+PLANE_LIMIT = np.cos(np.radians(70.0))
+_MIN_FOR_RANSAC = 8  # matches: five determine an essential matrix, three say whether it is right
+_CHUNK = 1024  # rows of the distance table at once: some megabytes
 
 
 def match_features(first: Features, second: Features, norm: int, ratio: float) -> I64:
@@ -72,7 +73,7 @@ def epipolar_inliers(bearings0: F64, bearings1: F64, threshold: float, rng: np.r
     count = len(bearings0)
     if count < _MIN_FOR_RANSAC:
         return np.zeros(count, bool)
-    if min(bearings0[:, 2].min(), bearings1[:, 2].min()) < _PINHOLE_LIMIT:
+    if min(bearings0[:, 2].min(), bearings1[:, 2].min()) < PLANE_LIMIT:
         try:
             return essential_ransac(bearings0, bearings1, threshold, rng, min_ratio=0.0).inliers
         except Degenerate:

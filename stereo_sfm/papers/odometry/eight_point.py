@@ -13,7 +13,7 @@ from stereo_sfm.geometry.essential import relative_pose
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 
-_MIN_SCALED = 5
+_MIN_SCALED = 5  # points with a depth: the median of their scales withstands two wrong ones
 
 
 def scale_from_points(rotation: np.ndarray, direction: np.ndarray, pair: FramePair, inliers: np.ndarray) -> float:

@@ -16,10 +16,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, refine_pose
 from stereo_sfm.geometry.procrustes import refuse_line
 from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.papers.matching import PLANE_LIMIT
 from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 from stereo_sfm.types import F64, Bool
-
-_PLANE_LIMIT = np.cos(np.radians(70.0))
 
 
 def pnp_ransac(
@@ -30,7 +29,7 @@ def pnp_ransac(
     Raises:
         Degenerate: "too_few_points", "no_consensus".
     """
-    usable = np.flatnonzero(bearings[:, 2] > _PLANE_LIMIT)
+    usable = np.flatnonzero(bearings[:, 2] > PLANE_LIMIT)
     if len(usable) < 6:
         raise Degenerate("too_few_points", f"{len(usable)} points with depth in view")
     focal = 1.0 / threshold
