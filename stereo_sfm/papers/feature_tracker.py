@@ -16,70 +16,39 @@ from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.papers.descriptor_tracker import DescriptorTracker
 from stereo_sfm.papers.estimators import make_estimator
 from stereo_sfm.papers.extraction import circle_mask
-from stereo_sfm.papers.feature_view import FeatureView, ViewMaker
-from stereo_sfm.papers.map_correction import KeyframePoses
+from stereo_sfm.papers.feature_view import FeatureView
+from stereo_sfm.papers.local_points import row_of
 from stereo_sfm.papers.motion_estimator import Motion
-from stereo_sfm.papers.outgoing import keyframe_of, observations_of
 from stereo_sfm.papers.pairing import Pairing
-from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.papers.step_scale import StepScale
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
-from stereo_sfm.types import (
-    F64,
-    I64,
-    U8,
-    Frame,
-    Keyframe,
-    MapUpdate,
-    StereoImage,
-    TrackState,
-    Trajectory,
-)
+from stereo_sfm.types import F64, I64, U8, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
 
 
-class FeatureTracker:
-    """One per run; `step` every image in order, `apply` every map update when the schedule says so."""
+class FeatureTracker(DescriptorTracker):
+    """Motions from frame to frame."""
 
     def __init__(
         self, config: Config, rig: Rig, spans: NoSpans | None = None, ground_truth: Trajectory | None = None
     ) -> None:
-        self._config = config
-        self._odometry = config.odometry
-        self._rig = rig
-        self._spans = spans or NoSpans()
-        self._views = ViewMaker(config.features, rig)
+        super().__init__(config, rig, spans)
         self._place_corners = PlaceCorners.wanted(config, rig)
         self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
-        self._pixel = rig.pixel_angle
         self._pairing = Pairing(config.features, self._pixel)
-        self._ids = PointIds()
-        self._odom_T_cam = np.eye(4)
-        self._velocity = np.eye(4)  # last_T_now of the last good step
         self._last: FeatureView | None = None
         self._odom_T_last = np.eye(4)
         self._last_stamp = 0
-        self._keyframe: FeatureView | None = None
-        self._kf_id = -1
-        self._odom_T_kf = np.eye(4)
-        self._kf_poses = KeyframePoses()
-        self._frames_since_kf = 0
-        self._lost = 0
-        self._lost_ns = 0  # the first of these frames
-        self._submap = 0
-        self._map_version = 0
 
     def apply(self, update: MapUpdate) -> None:
         """Take over fused ids and, for motions from a keyframe, the map's positions of its points."""
-        self._map_version = update.version
-        self._ids.fuse(update.fused_point_ids)
-        moved = self._kf_poses.correct(update)
+        moved = self._correct(update)
         if moved is not None:
-            self._odom_T_cam, self._odom_T_last = moved @ self._odom_T_cam, moved @ self._odom_T_last
-            self._odom_T_kf = moved @ self._odom_T_kf
+            self._odom_T_last = moved @ self._odom_T_last
         if self._last is not None:
             self._last = replace(self._last, ids=self._ids.current(self._last.ids))
         if self._keyframe is None:
@@ -90,10 +59,6 @@ class FeatureTracker:
         if self._odometry.reference == "keyframe" and len(own):
             kf_T_map = se3.inverse(update.map_T_kf[own[0]])
             self._keyframe = replace(self._keyframe, points=_moved(self._keyframe.points, ids, update, kf_T_map))
-
-    def describe(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe of the last step, which has its descriptors."""
-        return keyframe
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image."""
@@ -121,12 +86,11 @@ class FeatureTracker:
 
     def _begin(self, image: StereoImage, view: FeatureView) -> tuple[Frame, Keyframe | None]:
         if len(view) < self._odometry.min_inliers:
-            frame = self._frame(image, view, None, TrackState.INITIALIZING, "too_few_points", False)
-            return frame, None
+            return self._frame(image, view, TrackState.INITIALIZING, "too_few_points", False, _stats(None)), None
         view = self._ids.give_new(view)
         keyframe = self._make_keyframe(image, view)
         self._remember(image, view)
-        return self._frame(image, view, None, TrackState.OK, "", True), keyframe
+        return self._frame(image, view, TrackState.OK, "", True, _stats(None)), keyframe
 
     def _move(
         self, image: StereoImage, view: FeatureView, rng: np.random.Generator
@@ -154,19 +118,17 @@ class FeatureTracker:
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
         """No motion: continue with the last velocity; after some time without start a new submap there."""
-        self._lost_ns = self._lost_ns if self._lost else image.stamp_ns
-        self._lost += 1
-        seconds = (image.stamp_ns - self._lost_ns) * 1e-9
+        seconds = self._count_lost(image.stamp_ns)
         self._odom_T_cam = self._odom_T_cam @ self._velocity
         if seconds <= self._config.tracker.lost_s or len(view) < self._odometry.min_inliers:
-            return self._frame(image, view, None, TrackState.LOST, reason, False), None
+            return self._frame(image, view, TrackState.LOST, reason, False, _stats(None)), None
         self._lost = 0
         self._submap += 1
         self._velocity = np.eye(4)
         view = self._ids.give_new(view)
         keyframe = self._make_keyframe(image, view)
         self._remember(image, view)
-        return self._frame(image, view, None, TrackState.RESTARTED, reason, True), keyframe
+        return self._frame(image, view, TrackState.RESTARTED, reason, True, _stats(None)), keyframe
 
     def _finish(
         self, image: StereoImage, view: FeatureView, motion: Motion, state: TrackState
@@ -175,7 +137,7 @@ class FeatureTracker:
         chosen = np.isfinite(view.points[:, 2]) & (view.ages > 0)
         covariance = pose_covariance(view.points[chosen], self._pixel)
         wanted = self._wants_keyframe(view, int(motion.inliers.sum()))
-        frame = self._frame(image, view, motion, state, "", wanted, covariance)
+        frame = self._frame(image, view, state, "", wanted, _stats(motion), covariance)
         keyframe = self._make_keyframe(image, view) if wanted else None
         self._remember(image, view)
         return (replace(frame, reference_kf_id=self._kf_id, kf_T_cam=np.eye(4)) if wanted else frame), keyframe
@@ -194,12 +156,7 @@ class FeatureTracker:
         return bool(tracked < o.keyframe_ratio)
 
     def _make_keyframe(self, image: StereoImage, view: FeatureView) -> Keyframe:
-        self._kf_id += 1
-        self._keyframe = view
-        self._odom_T_kf = self._odom_T_cam
-        self._kf_poses.add(self._kf_id, self._odom_T_cam)
-        self._frames_since_kf = 0
-        keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap)
+        keyframe = self._enter(view, image.stamp_ns, self._odom_T_cam)
         if self._place_corners is None:
             return keyframe
         return replace(keyframe, corners=self._place_corners.find(image))
@@ -207,43 +164,16 @@ class FeatureTracker:
     def _remember(self, image: StereoImage, view: FeatureView) -> None:
         self._last, self._odom_T_last, self._last_stamp = view, self._odom_T_cam, image.stamp_ns
 
-    def _frame(
-        self,
-        image: StereoImage,
-        view: FeatureView,
-        motion: Motion | None,
-        state: TrackState,
-        reason: str,
-        is_keyframe: bool,
-        covariance: F64 | None = None,
-    ) -> Frame:
-        stats = {"features": float(len(view)), "inliers": 0.0 if motion is None else float(motion.inliers.sum())}
-        if motion is not None:
-            stats |= {"matches": float(len(motion.inliers)), **motion.stats}
-        return Frame(
-            frame_id=image.frame_id,
-            stamp_ns=image.stamp_ns,
-            odom_T_cam=self._odom_T_cam.copy(),
-            covariance=np.eye(6) if covariance is None else covariance,
-            state=state,
-            reason=reason,
-            observations=observations_of(view),
-            reference_kf_id=self._kf_id,
-            kf_T_cam=se3.inverse(self._odom_T_kf) @ self._odom_T_cam,
-            map_version=self._map_version,
-            is_keyframe=is_keyframe,
-            stats=stats,
-        )
+
+def _stats(motion: Motion | None) -> dict[str, float]:
+    """Of a frame."""
+    if motion is None:
+        return {"inliers": 0.0}
+    return {"inliers": float(motion.inliers.sum()), "matches": float(len(motion.inliers)), **motion.stats}
 
 
 def _moved(points: F64, ids: I64, update: MapUpdate, kf_T_map: F64) -> F64:
     """(N, 3) points of a keyframe with the map's positions where the update has them."""
-    if len(update.point_ids) == 0:
-        return points
-    order = np.argsort(update.point_ids, kind="stable")
-    slot = np.searchsorted(update.point_ids[order], ids).clip(0, len(order) - 1)
-    row = order[slot]
-    hit = update.point_ids[row] == ids
-    out = points.copy()
-    out[hit] = se3.transform(kf_T_map, update.points_map[row[hit]])
+    row, out = row_of(update.point_ids, ids), points.copy()
+    out[row >= 0] = se3.transform(kf_T_map, update.points_map[row[row >= 0]])
     return out

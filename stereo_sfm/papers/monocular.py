@@ -17,15 +17,13 @@ from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.papers.descriptor_tracker import DescriptorTracker
 from stereo_sfm.papers.extraction import feature_kind
-from stereo_sfm.papers.feature_view import FeatureView, ViewMaker
+from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.papers.local_points import LocalPoints
-from stereo_sfm.papers.map_correction import KeyframePoses
 from stereo_sfm.papers.matching import epipolar_inliers, match_features
 from stereo_sfm.papers.monocular_start import MIN_MATCHES, MIN_PARALLAX_DEG, good_points, start_from
 from stereo_sfm.papers.odometry.pnp import pnp_pose
-from stereo_sfm.papers.outgoing import keyframe_of, observations_of
-from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
@@ -35,38 +33,21 @@ _MAX_TURN = np.radians(30.0)  # radians, the same of its rotation
 _REPROJECT_PX = 3.0  # px by which a point may be off its projection: that of a keyframe before bundle adjustment
 
 
-class MonocularTracker:
-    """One per run. Unit of length: the median distance of the first points, of every new map again."""
+class MonocularTracker(DescriptorTracker):
+    """Unit of length: the median distance of the first points, of every new map again."""
 
     def __init__(self, config: Config, rig: Rig, spans: NoSpans | None = None) -> None:
-        self._config = config
-        self._odometry = config.odometry
-        self._spans = spans or NoSpans()
-        self._views = ViewMaker(config.features, Rig(rig.left, left_mask=rig.left_mask))
+        super().__init__(config, Rig(rig.left, left_mask=rig.left_mask), spans)
         self._kind = feature_kind(config.features.kind)
-        self._pixel = rig.pixel_angle
-        self._ids = PointIds()
         self._local = LocalPoints(np.zeros(0, np.int64), np.zeros((0, 3)), self._kind.empty())
         self._first: FeatureView | None = None
         self._first_stamp, self._first_age = 0, 0
-        self._keyframe: FeatureView | None = None
-        self._kf_id, self._submap = -1, 0
-        self._odom_T_cam = np.eye(4)
-        self._odom_T_kf = np.eye(4)
-        self._kf_poses = KeyframePoses()
-        self._velocity = np.eye(4)
-        self._frames_since_kf = self._lost = self._map_version = 0
-        self._lost_ns = 0  # the first frame without a pose
         self._force_keyframe = False
 
     def apply(self, update: MapUpdate) -> None:
         """Take the map's points and go on from where it puts the newest keyframe that both know."""
-        self._map_version = update.version
-        self._ids.fuse(update.fused_point_ids)
+        self._correct(update)
         self._local.apply(update, self._ids)
-        moved = self._kf_poses.correct(update)
-        if moved is not None:
-            self._odom_T_cam, self._odom_T_kf = moved @ self._odom_T_cam, moved @ self._odom_T_kf
         if self._keyframe is not None:
             self._keyframe = self._with_positions(self._keyframe, self._odom_T_kf)
 
@@ -75,10 +56,6 @@ class MonocularTracker:
         ids = self._ids.current(view.ids)
         points = se3.transform(se3.inverse(odom_T_cam), self._local.positions(ids))
         return replace(view, ids=ids, points=points)
-
-    def describe(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe of the last step, which has its descriptors."""
-        return keyframe
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image, by its left camera only."""
@@ -116,13 +93,13 @@ class MonocularTracker:
         self._odom_T_kf = self._odom_T_cam
         self._force_keyframe = True  # the second view of the map follows with the next frame
         state = TrackState.OK if self._submap == 0 else TrackState.RESTARTED
-        return self._frame(image, self._keyframe, len(rows), state, "", True, np.eye(6)), keyframe
+        return self._frame(image, self._keyframe, state, "", True, {"inliers": float(len(rows))}), keyframe
 
     def _wait(self, image: StereoImage, view: FeatureView, reason: str, new_first: bool) -> tuple[Frame, None]:
         if new_first:
             self._first, self._first_stamp, self._first_age = view, image.stamp_ns, 0
         state = TrackState.INITIALIZING if self._submap == 0 else TrackState.LOST
-        return self._frame(image, view, 0, state, reason, False, np.eye(6)), None
+        return self._frame(image, view, state, reason, False, {"inliers": 0.0}), None
 
     # -- tracking --------------------------------------------------------------------------------------------------
 
@@ -145,12 +122,13 @@ class MonocularTracker:
         self._frames_since_kf += 1
         seen = self._ids.inherit(view, self._keyframe, known[inliers])
         covariance = pose_covariance(se3.transform(cam_T_kf, self._keyframe.points[known[inliers, 0]]), self._pixel)
-        wanted = self._wants_keyframe(int(inliers.sum()))
+        agreeing = int(inliers.sum())
+        wanted = self._wants_keyframe(agreeing)
         keyframe = None
         if wanted:
             seen = self._new_keyframe_view(seen, rows, rng)
             keyframe = self._enter(seen, image.stamp_ns, self._odom_T_cam)
-        return self._frame(image, seen, int(inliers.sum()), state, "", wanted, covariance), keyframe
+        return self._frame(image, seen, state, "", wanted, {"inliers": float(agreeing)}, covariance), keyframe
 
     def _check(self, pose: F64, points: F64) -> None:
         """A bad pose is filtered: no camera moves by half the distance of what it sees, or turns 30 degrees, a frame.
@@ -215,52 +193,21 @@ class MonocularTracker:
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, None]:
         """Stay where the motion was going and look for the keyframe again; after a while begin a new map."""
-        self._lost_ns = self._lost_ns if self._lost else image.stamp_ns
-        self._lost += 1
+        seconds = self._count_lost(image.stamp_ns)
         if self._lost <= 3:
             self._odom_T_cam = self._odom_T_cam @ self._velocity
-        if (image.stamp_ns - self._lost_ns) * 1e-9 > self._config.tracker.lost_s:
+        if seconds > self._config.tracker.lost_s:
             self._submap += 1
             self._lost = 0
             self._keyframe = None
             self._first, self._first_stamp, self._first_age = view, image.stamp_ns, 0
             self._local = LocalPoints(np.zeros(0, np.int64), np.zeros((0, 3)), self._kind.empty())
-        return self._frame(image, view, 0, TrackState.LOST, reason, False, np.eye(6)), None
-
-    # -- messages --------------------------------------------------------------------------------------------------
+        return self._frame(image, view, TrackState.LOST, reason, False, {"inliers": 0.0}), None
 
     def _enter(self, view: FeatureView, stamp_ns: int, odom_T_cam: F64) -> Keyframe:
-        self._kf_id += 1
+        """Its points are matched with later keyframes, too."""
         self._local.add(view, odom_T_cam)
-        self._keyframe, self._odom_T_kf = view, odom_T_cam
-        self._kf_poses.add(self._kf_id, odom_T_cam)
-        self._frames_since_kf = 0
-        return keyframe_of(view, stamp_ns, self._kf_id, odom_T_cam, self._submap)
-
-    def _frame(
-        self,
-        image: StereoImage,
-        view: FeatureView,
-        inliers: int,
-        state: TrackState,
-        reason: str,
-        is_keyframe: bool,
-        covariance: F64,
-    ) -> Frame:
-        return Frame(
-            frame_id=image.frame_id,
-            stamp_ns=image.stamp_ns,
-            odom_T_cam=self._odom_T_cam.copy(),
-            covariance=covariance,
-            state=state,
-            reason=reason,
-            observations=observations_of(view),
-            reference_kf_id=self._kf_id,
-            kf_T_cam=se3.inverse(self._kf_poses.pose(self._kf_id)) @ self._odom_T_cam,
-            map_version=self._map_version,
-            is_keyframe=is_keyframe,
-            stats={"features": float(len(view)), "inliers": float(inliers)},
-        )
+        return super()._enter(view, stamp_ns, odom_T_cam)
 
 
 def _spread(values: F64, rows: I64, count: int) -> F64:
