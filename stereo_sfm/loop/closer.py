@@ -26,7 +26,7 @@ from stereo_sfm.loop.sideways import (
     TURNED,
     Fronts,
     front_of,
-    sideways_config,
+    of_a_part,
     with_neighbours,
 )
 from stereo_sfm.loop.verification import (
@@ -100,7 +100,7 @@ class LoopCloser:
 
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
-        self._side_config = sideways_config(config)
+        self._side_config = of_a_part(config, config.side_inliers)
         self._chance = config.relocalize_share  # of corners that agree where a place only looks alike
         self._source_rig, self._rig_terms = rig, np.zeros(RIG_TERMS)
         self._own: dict[int, Rig] = {}  # of keyframes of other rigs

@@ -24,14 +24,10 @@ SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it
 TURNED = np.cos(np.deg2rad(60.0))  # of the optical axes of keyframes that only views to the side can compare
 
 
-def sideways_config(config: LoopConfig) -> LoopConfig:
-    """What the verification asks for: fewer corners, since directions share but a part of the views."""
+def of_a_part(config: LoopConfig, min_inliers: int) -> LoopConfig:
+    """What the verification asks for where but a part of a view is seen: so many corners, whatever their share."""
     return dataclasses.replace(
-        config,
-        min_match_fraction=0.0,
-        min_inliers=config.side_inliers,
-        min_inlier_share=0.0,
-        min_cells=config.fewer_cells,
+        config, min_match_fraction=0.0, min_inliers=min_inliers, min_inlier_share=0.0, min_cells=config.fewer_cells
     )
 
 

@@ -24,7 +24,7 @@ from stereo_sfm.loop.sideways import (
     TURNED,
     Fronts,
     front_of,
-    sideways_config,
+    of_a_part,
     with_neighbours,
 )
 from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
@@ -94,15 +94,9 @@ class Relocalizer:
         self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
-        self.config = dataclasses.replace(
-            config,
-            min_match_fraction=0.0,
-            min_inliers=config.relocalize_inliers // 3,  # competing places must be known
-            min_inlier_share=0.0,
-            min_cells=config.fewer_cells,
-        )
+        self.config = of_a_part(config, config.relocalize_inliers // 3)  # competing places must be known
         self._side_inliers = config.side_inliers
-        self._side_config = dataclasses.replace(sideways_config(config), min_inliers=self._side_inliers // 2)
+        self._side_config = of_a_part(config, self._side_inliers // 2)
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
