@@ -1,6 +1,6 @@
 """Place database: the words of all keyframes in one table.
 
-A query reads the whole table, a millisecond for some thousand keyframes: less than matching one of them.
+A query reads the whole table, a millisecond for a thousand keyframes: less than matching one of them.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false

@@ -20,8 +20,6 @@ from stereo_sfm.mapping.map import POSE_POINTS, Map
 from stereo_sfm.mapping.motion_factors import motion_factors
 from stereo_sfm.types import F64, I64, Bool
 
-FINAL_ROUNDS = 4  # of the last full bundle adjustment, twice the usual: weights are to converge
-
 
 @dataclass(frozen=True, eq=False)
 class Window:
@@ -48,12 +46,14 @@ def bundle_config(config: MapperConfig) -> BundleConfig:
 def final_bundle_config(config: MapperConfig) -> BundleConfig:
     """Those of the last full bundle adjustment.
 
-    It converges, also in the weights and in the scale, which is slow. With one loss over both images: where a match
-    disagrees, because its window shows two surfaces, the pixel of the left image is no better. (During the run the
-    right images may all disagree for a while, after a knock, and the left ones hold the map together.)
+    It converges, also in the weights, for which it has twice as many rounds, and in the scale, which is slow. With one
+    loss over both images: where a match disagrees, because its window shows two surfaces, the pixel of the left image
+    is no better. (During the run the right images may all disagree for a while, after a knock, and the left ones hold
+    the map together.)
     """
+    usual = bundle_config(config)
     return dataclasses.replace(
-        bundle_config(config), rounds=FINAL_ROUNDS, iterations=config.final_iterations, joint_loss=True, extend=True
+        usual, rounds=2 * usual.rounds, iterations=config.final_iterations, joint_loss=True, extend=True
     )
 
 

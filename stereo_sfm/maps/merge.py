@@ -19,7 +19,6 @@ from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import I64, Bool, LoopResult
 
 _MAPPER = MapperConfig()
-MIN_SHARED_PIXELS = 0.5  # of the pixels at common times, in maps of one session; different images share hardly any
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +77,7 @@ def _same_session(a: I64, b: I64) -> bool:
     a, b = (part[np.isin(part[:, 0], times)] for part in (a, b))
     same = len(a) + len(b) - len(np.unique(np.concatenate([a, b]), axis=0))
     counts = [np.unique(part[:, 0], return_counts=True)[1] for part in (a, b)]
-    return bool(same > MIN_SHARED_PIXELS * np.minimum(*counts).sum())
+    return bool(2 * same > np.minimum(*counts).sum())  # different images share hardly any
 
 
 def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:
