@@ -47,24 +47,13 @@ class MapCamera:
 
 def unified(rigs: Sequence[Rig]) -> list[Rig]:
     """The rigs in their order, with one object for those whose cameras are the same to the bit: the first of them."""
-    known: list[Rig] = []
-    out: list[Rig] = []
-    for rig in rigs:
-        same = next((k for k in known if k is rig or _same_bits(k, rig)), None)
-        if same is None:
-            known.append(rig)
-        out.append(rig if same is None else same)
-    return out
+    known: dict[Any, Rig] = {}
+    return [known.setdefault(_bits(rig), rig) for rig in rigs]
 
 
-def _same_bits(a: Rig, b: Rig) -> bool:
-    cameras = _cameras(a, b)
-    same = all(x is not None and y is not None and _same_lens(x, y) for _, x, y in cameras)
-    return same and a.depth == b.depth and np.array_equal(a.left_T_right, b.left_T_right)
-
-
-def _same_lens(a: Camera, b: Camera) -> bool:
-    return a.model_id == b.model_id and a.size == b.size and np.array_equal(a.params, b.params)
+def _bits(rig: Rig) -> Any:
+    lenses = [None if c is None else (c.model_id, c.size, c.params.tobytes()) for c in (rig.left, rig.right)]
+    return *lenses, rig.depth, rig.left_T_right.tobytes()
 
 
 def _cameras(a: Rig, b: Rig) -> list[tuple[str, Camera | None, Camera | None]]:
