@@ -8,6 +8,7 @@ that holds their roll and pitch: four degrees of freedom are left to drift.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,13 +60,7 @@ class PoseGraphResult:
 
 def join(edges: list[Edges]) -> Edges:
     """All edges, in order."""
-    return Edges(
-        np.concatenate([e.i for e in edges]),
-        np.concatenate([e.j for e in edges]),
-        np.concatenate([e.i_T_j for e in edges]),
-        np.concatenate([e.sigmas for e in edges]),
-        np.concatenate([e.loop for e in edges]),
-    )
+    return Edges(*(np.concatenate([getattr(e, f.name) for e in edges]) for f in dataclasses.fields(Edges)))
 
 
 def edges_of_poses(poses: F64, i: I64, j: I64, metres_per_metre: float, radians_per_metre: float) -> Edges:
