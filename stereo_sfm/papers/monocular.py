@@ -29,7 +29,7 @@ from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoI
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner
 _MAX_STEP = 0.5  # of the median distance of the points: a larger step between frames is an error
-_MAX_TURN = np.radians(30.0)  # radians, the same of its rotation
+_MAX_TURN = np.radians(30.0)  # radians, for its rotation
 _REPROJECT_PX = 3.0  # px by which a point may be off its projection: that of a keyframe before bundle adjustment
 
 
