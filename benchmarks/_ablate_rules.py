@@ -298,11 +298,11 @@ RULES = (
     _rule(
         "weak points",
         MAPPER,
-        "weak = culling.weak_points(self.map, self._rig, rows, row, self._config)",
+        "weak = culling.weak_points(self.map, self.rig, rows, row, self._config)",
         "weak = rows[:0]",
     ),
     _rule(
-        "triangulated anew", MAPPER, "self.map.move_points(recent, triangulate(self.map, self._rig, recent))", "pass"
+        "triangulated anew", MAPPER, "self.map.move_points(recent, triangulate(self.map, self.rig, recent))", "pass"
     ),
     # Loops.
     _rule("rival loops", CLOSER, "if any(self._rivals(h, loop, support) for h in self._pending):", "if False:"),

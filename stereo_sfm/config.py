@@ -72,8 +72,8 @@ REMOVED = {
 
 
 def estimator_names() -> tuple[str, ...]:
-    """The motion estimators other than `flow`: one file each in tracking/features/odometry/."""
-    folder = Path(__file__).parent / "tracking" / "features" / "odometry"
+    """The motion estimators other than `flow`: one file each in papers/odometry/."""
+    folder = Path(__file__).parent / "papers" / "odometry"
     return tuple(sorted(path.stem.replace("_", "-") for path in folder.glob("[a-z]*.py")))
 
 
@@ -131,7 +131,7 @@ class TrackerConfig:
 
 @dataclass(frozen=True)
 class FeaturesConfig:
-    """Descriptors and matching of the selectable trackers (tracking/features/)."""
+    """Descriptors and matching of the selectable trackers (papers/)."""
 
     kind: str = word("sift", ("orb", "sift", "akaze"), "Detector and descriptor")
     count: int = number(
@@ -149,7 +149,7 @@ class FeaturesConfig:
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """Which motion estimator, and its policy (tracking/features/odometry/); "flow" is the default tracker."""
+    """Which motion estimator, and its policy (papers/odometry/); "flow" is the default tracker."""
 
     method: str = word("flow", ("flow", *estimator_names()), "Motion estimator")
     reference: str = word(

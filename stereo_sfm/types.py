@@ -39,6 +39,11 @@ def shape(*axes: int) -> dict[str, tuple[int, ...]]:
     return {"shape": axes}
 
 
+def no_ids(*axes: int) -> I64:
+    """An empty array of ids, (0,) or of the given shape."""
+    return np.zeros(axes or (0,), np.int64)
+
+
 class ReadOnly:
     """Base of what has read-only arrays."""
 
@@ -388,20 +393,19 @@ class MapUpdate(Message):
     kf_id: int  # the keyframe whose result it is
     kf_ids: I64  # (K,) living keyframes that are new or moved
     map_T_kf: F64 = field(metadata=shape(-1, 4, 4))  # (K, 4, 4) their new poses
-    point_ids: I64  # (P,) new or moved points, in track ids
-    points_map: F64 = field(metadata=shape(-1, 3))  # (P, 3) their positions, metres in the map
-    culled_point_ids: I64  # (C,) points removed from the map
-    fused_point_ids: I64 = field(metadata=shape(-1, 2))  # (D, 2) old id -> id that replaces it
-    map_T_odom: F64 = field(metadata=shape(4, 4))  # (4, 4) takes poses of the odometry into the map, from now on
-    culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes removed from the map
-    carrier_kf_ids: I64 = field(
-        default_factory=lambda: np.zeros(0, np.int64)
-    )  # (R,) the keyframe that each moves with from now on
-    # their poses relative to those
+    point_ids: I64 = field(default_factory=no_ids)  # (P,) new or moved points, in track ids
+    # (P, 3) their positions, metres in the map
+    points_map: F64 = field(default_factory=lambda: np.zeros((0, 3)), metadata=shape(-1, 3))
+    culled_point_ids: I64 = field(default_factory=no_ids)  # (C,) points removed from the map
+    # (D, 2) old id -> id that replaces it
+    fused_point_ids: I64 = field(default_factory=lambda: no_ids(0, 2), metadata=shape(-1, 2))
+    # (4, 4) takes poses of the odometry into the map, from now on
+    map_T_odom: F64 = field(default_factory=lambda: np.eye(4), metadata=shape(4, 4))
+    culled_kf_ids: I64 = field(default_factory=no_ids)  # (R,) keyframes removed from the map
+    carrier_kf_ids: I64 = field(default_factory=no_ids)  # (R,) the keyframe that each moves with from now on
+    # (R, 4, 4) their poses relative to those
     carrier_T_kf: F64 = field(default_factory=lambda: np.zeros((0, 4, 4)), metadata=shape(-1, 4, 4))
-    refused_kf_ids: I64 = field(
-        default_factory=lambda: np.zeros(0, np.int64)
-    )  # (L,) whose accepted loop the mapper rejected
+    refused_kf_ids: I64 = field(default_factory=no_ids)  # (L,) whose accepted loop the mapper rejected
     calibration: CalibrationUpdate | None = None  # the rig from this update on, where that changes
     row_errors: RowErrors | None = None  # only with two cameras
     sensors: SensorUpdate | None = None  # the calibration of IMU and wheels from this update on, where that changes
@@ -426,8 +430,8 @@ class LoopResult(Message):
     reason: str
     rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)
     # (S, 3) corners of side views that the loop matched: number of the corner, keyframe, row in its `sides`
-    sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64), metadata=shape(-1, 3))
-    forgotten_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (F,) that no later result names
+    sightings: I64 = field(default_factory=lambda: no_ids(0, 3), metadata=shape(-1, 3))
+    forgotten_kf_ids: I64 = field(default_factory=no_ids)  # (F,) that no later result names
 
     @property
     def failed(self) -> bool:
@@ -439,8 +443,7 @@ class LoopResult(Message):
         kf_id: int, reason: str, score: float = 0.0, rejected: tuple[tuple[int, float, str], ...] = ()
     ) -> LoopResult:
         """The result for a keyframe that closes no loop."""
-        none = np.zeros((0, 2), np.int64)
-        return LoopResult(kf_id, -1, np.eye(4), np.zeros((6, 6)), none, 0, score, reason, rejected)
+        return LoopResult(kf_id, -1, np.eye(4), np.zeros((6, 6)), no_ids(0, 2), 0, score, reason, rejected)
 
 
 @dataclass(frozen=True)

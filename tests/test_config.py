@@ -14,10 +14,10 @@ import pytest
 from stereo_sfm.config import REMOVED, RENAMED, Config, dump, estimator_names, explain, from_dict, load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.pose_graph import ROBUST
+from stereo_sfm.papers.extraction import TABLE as FEATURES
+from stereo_sfm.papers.step_scale import SCALES
 from stereo_sfm.presets import PRESETS
 from stereo_sfm.settings import walk
-from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
-from stereo_sfm.tracking.features.step_scale import SCALES
 
 
 @pytest.mark.parametrize(

@@ -106,8 +106,8 @@ def ablation(options: AblationOptions) -> int:
 def _cells(options: AblationOptions) -> list[Cell]:
     from stereo_sfm.config import estimator_names
     from stereo_sfm.eval import ablation
+    from stereo_sfm.papers.extraction import TABLE as FEATURES
     from stereo_sfm.presets import PRESETS
-    from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
 
     if options.jobs < 1 or options.frames < 0:
         raise StereoSfmError("--jobs must be at least 1 and --frames at least 0")

@@ -17,7 +17,7 @@ from stereo_sfm.calib.formats.colmap import write_colmap_rigs
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, I64
 

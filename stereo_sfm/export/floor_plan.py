@@ -16,7 +16,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.floor import HIGH, LOW, find_floor
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, I32, U8

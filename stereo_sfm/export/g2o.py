@@ -9,8 +9,8 @@ import scipy.sparse
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.correction import COVISIBLE_POINTS, ODOMETRY
-from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.pose_graph import Edges, edges_of_poses
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap
 
 

@@ -15,12 +15,13 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.loop import p3p, pose_kernels
 from stereo_sfm.loop.p3p import Lens
 from stereo_sfm.types import F64, I64, Bool
 
-CHI2_2DOF_95 = 5.991
-IDENTITY, DAMPING = np.eye(4), 1e-9 * np.eye(6)
+CHI2_2DOF_95 = chi_squared(0.95, 2)  # sigmas^2, of a pixel beyond which a match disagrees
+DAMPING = 1e-9 * np.eye(6)  # m^-2, rad^-2: a direction of which nothing is known stays
 
 
 class Matches(NamedTuple):
@@ -120,7 +121,7 @@ def _normal_equations(
         poses = t, camera_T_left, ahead, behind
         pose_kernels.add_normal_equations(*poses, seen, inlier, lens, (hessian, gradient, sums))
 
-    add(rig.left, IDENTITY, t, back, m.uv_left_b, m.uv_left_a)
+    add(rig.left, np.eye(4), t, back, m.uv_left_b, m.uv_left_a)
     if rig.right is not None and right_T_left is not None:
         add(rig.right, right_T_left, right_T_left @ t, right_T_left @ back, m.uv_right_b, m.uv_right_a)
     return hessian, gradient, float(np.sqrt(sums[0] / max(2 * sums[1], 1)))

@@ -16,7 +16,7 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.cloud import Cloud, gather
-from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
@@ -26,7 +26,7 @@ from stereo_sfm.loop.sideways import (
     TURNED,
     Fronts,
     front_of,
-    sideways_config,
+    of_a_part,
     with_neighbours,
 )
 from stereo_sfm.loop.verification import (
@@ -45,15 +45,18 @@ from stereo_sfm.mapping.culling import OF_A_VIEW, OF_EARLIER_VISITS, PASSED
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
-CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
-PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
+CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own: on both sides of it
+PLACE_RADIUS = (
+    3  # keyframes: candidates at most so many keyframes apart are one place: only the best of them is verified
+)
 KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the same of the share of corners of its best keyframe, where several found it
-LOOKALIKES = 3000  # hypotheses between sessions that are remembered
+LOOKALIKES = 3000  # hypotheses between sessions that are remembered: it bounds memory
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
-AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # largest difference of two keyframes' estimates of one loop
+# Largest difference of two keyframes' estimates of one loop: noise of both, and drift between them.
+AGREE_METRES, AGREE_DEGREES = 0.15, 2.0
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ class LoopCloser:
 
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
-        self._side_config = sideways_config(config)
+        self._side_config = of_a_part(config, config.side_inliers)
         self._chance = config.relocalize_share  # of corners that agree where a place only looks alike
         self._source_rig, self._rig_terms = rig, np.zeros(RIG_TERMS)
         self._own: dict[int, Rig] = {}  # of keyframes of other rigs
@@ -230,18 +233,11 @@ class LoopCloser:
         reference = pick((scores[self._row[k]] for k in connected), default=0.0)
         bound = max(config.score_ratio * reference, config.min_score)
         excluded = self._near(keyframe.kf_id, connected)
-        ids = self._database.kf_ids
-        good = [i for i in np.flatnonzero(scores > bound).tolist() if int(ids[i]) in self._store]
-        good = [i for i in good if int(ids[i]) not in excluded]
-        good.sort(key=lambda i: (-scores[i], i))
-        places: list[int] = []
-        if config.proximity:
-            places += self._graph.nearby(keyframe.kf_id, excluded)
-        wanted = config.max_candidates + len(places)
-        for i in good:
-            kf_id = int(ids[i])
-            if len(places) < wanted and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
-                places.append(kf_id)
+        good = np.flatnonzero(scores > bound)
+        good = self._database.kf_ids[good[np.argsort(-scores[good], kind="stable")]].tolist()
+        near = self._graph.nearby(keyframe.kf_id, excluded) if config.proximity else []
+        free = (k for k in good if k in self._store and k not in excluded)
+        places = apart(free, PLACE_RADIUS, config.max_candidates + len(near), near)
         found = [Candidate(k, float(scores[self._row[k]])) for k in places]
         return found + self._side_candidates(keyframe, side_bag, excluded), "no_candidate"
 
@@ -263,14 +259,12 @@ class LoopCloser:
         turned = graph_ids[self._fronts.turned(front_of(keyframe), cam_T_kf)].tolist()
         places = [k for k in turned if k in self._store and k not in excluded][:1]
         wanted = 2 if places else self._config.max_candidates
-        ids = self._side_database.kf_ids
-        for i in np.lexsort((np.arange(len(scores)), -with_neighbours(scores))).tolist():
-            if pauses or len(places) == wanted or scores[i] < self._config.min_score:
-                break
-            kf_id = int(ids[i])
-            free = kf_id in self._store and kf_id not in excluded
-            if free and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
-                places.append(kf_id)
+        if not pauses:
+            best = np.argsort(-with_neighbours(scores), kind="stable")
+            good = best[np.logical_and.accumulate(scores[best] >= self._config.min_score)]
+            ids = self._side_database.kf_ids[good].tolist()
+            free = (k for k in ids if k in self._store and k not in excluded)
+            places = apart(free, PLACE_RADIUS, wanted, places)
         return [Candidate(k, float(scores[self._row[k]]), True) for k in places]
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:

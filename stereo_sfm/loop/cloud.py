@@ -19,8 +19,8 @@ from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
-SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # largest differences of one corner in two keyframes
-CORNERS = 10**6  # more than a keyframe has: makes temporary ids of corners unique
+# Largest differences of one corner in two keyframes: of positions by stereo, of descriptors (as of points of the map).
+SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,10 +88,11 @@ def _name_corners(views: Sequence[PlaceView], cloud: Cloud, rig: Rig) -> I64:
     rows = np.flatnonzero(cloud.corner)
     ends = np.searchsorted(cloud.view[rows], np.arange(len(views)), side="right")
     points, words, kinds = cloud.points[rows], as_words(cloud.descriptors[rows]), np.ones(len(rows), bool)
-    ids = np.empty(len(rows), np.int64)
+    ids, named = np.empty(len(rows), np.int64), 0
     for k, view in enumerate(views):
         count = int(view.corner.sum())  # they come first
-        names, before = -1 - k * CORNERS - np.arange(count), ends[k - 1] if k else 0
+        names, before = -1 - named - np.arange(count), ends[k - 1] if k else 0
+        named += count
         if before:
             uv = rig.left.project(se3.transform(se3.inverse(cloud.centre_T_kf[k]), points[:before]))
             best = _nearest_within(

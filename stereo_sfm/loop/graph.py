@@ -13,16 +13,18 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Bool
 
-NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views
-SAME_METRES, SAME_RADIANS = 0.3, 0.25  # between keyframes of the same view
-GAP_METRES = 0.3  # constant part of the tolerance after a gap in tracking
-GAP_SHARE = 0.75  # part of the tolerance proportional to the distance at the speed before the gap
+NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views, of shelves a few metres away
+SAME_METRES, SAME_RADIANS = 0.3, 0.25  # between keyframes of the same view: about `culling`'s at a depth of two metres
+GAP_METRES = 0.3  # metres, constant part of the tolerance after a gap in tracking: that of `LoopConfig.gate_m`
+GAP_SHARE = (
+    0.75  # of the distance at the speed before the gap: from its middle to 1.25 times it, at half the speed more
+)
 MIN_SPEED = 0.5  # metres a second, lower bound of that speed
-SPEED_NS = 1_000_000_000  # time before a gap over which it is measured
-KNOWN_PATHS = 4096  # that are remembered
+SPEED_NS = 1_000_000_000  # before a gap, over which it is measured: what covers a camera disturbs its last few poses
+KNOWN_PATHS = 4096  # that are remembered, a few megabytes
 FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
 NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two chains half
-AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there
+AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there: a second has fewer
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
 

@@ -12,7 +12,7 @@ from stereo_sfm.loop import binary
 from stereo_sfm.loop.other_camera import seen_by
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
-KEPT = 64  # newest results: the same keyframes are candidates again and again
+KEPT = 64  # newest results, some megabytes: the same keyframes are candidates again and again
 
 
 @dataclass(frozen=True, eq=False)

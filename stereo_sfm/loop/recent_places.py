@@ -16,10 +16,10 @@ from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.loop.verification import pair
 from stereo_sfm.types import F64, Keyframe
 
-NEWEST_KEYFRAMES = 12  # searched
+NEWEST_KEYFRAMES = 12  # searched: where a camera can be after a short loss
 NEAREST = 2  # keyframes that are matched, of the most similar views, and others whose points are added to each one's
 WINDOWS = 0.05, 0.12, 0.3  # radius of the search, as shares of the image's width
-MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners
+MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners: a hypothesis, which tracking verifies
 
 
 class RecentPlaces:

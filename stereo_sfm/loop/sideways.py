@@ -13,24 +13,21 @@ import numpy as np
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Keyframe
 
-MIN_CORNERS = 20  # corners of a keyframe with which a search is worth it
-SAMPLES = 24  # corners of a keyframe that stand for what its views show
+MIN_CORNERS = 20  # of a keyframe with which a search is worth it: a loop across directions needs twice as many
+SAMPLES = 24  # corners of a keyframe that stand for what its views show: their overlap is a mean of them
 REACH = 2.0  # of a camera whose views may show the same fronts: in median distances of what its own show
 MIN_OVERLAP = 0.2  # of two keyframes' views, of at most 1
 SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it
 TURNED = np.cos(np.deg2rad(60.0))  # of the optical axes of keyframes that only views to the side can compare
 
 
-def sideways_config(config: LoopConfig) -> LoopConfig:
-    """What the verification asks for: fewer corners, since directions share but a part of the views."""
+def of_a_part(config: LoopConfig, min_inliers: int) -> LoopConfig:
+    """What the verification asks for where but a part of a view is seen: so many corners, whatever their share."""
     return dataclasses.replace(
-        config,
-        min_match_fraction=0.0,
-        min_inliers=config.side_inliers,
-        min_inlier_share=0.0,
-        min_cells=config.fewer_cells,
+        config, min_match_fraction=0.0, min_inliers=min_inliers, min_inlier_share=0.0, min_cells=config.fewer_cells
     )
 
 
@@ -54,24 +51,18 @@ def front_of(keyframe: Keyframe) -> F64:
     return points[np.linspace(0, len(points) - 1, SAMPLES).astype(int)].astype(np.float64)
 
 
-class Fronts:
+class Fronts(Columns):
     """What the views of keyframes show, one row each."""
 
+    points: F64 = column(np.float64, np.nan, (SAMPLES, 3))  # in the keyframe's camera; NaN without views
+
     def __init__(self, camera: Camera) -> None:
+        super().__init__()
         self._camera = camera
-        self._points: F64 = np.empty((64, SAMPLES, 3))  # in the keyframe's camera; NaN without views
-        self._count = 0
 
     def add(self, keyframe: Keyframe) -> None:
         """Remember the newest keyframe."""
-        if self._count == len(self._points):
-            self._points = np.concatenate([self._points, np.empty((max(self._count, 64), SAMPLES, 3))])
-        self._points[self._count] = front_of(keyframe)
-        self._count += 1
-
-    def keep(self, rows: I64) -> None:
-        """Only these rows stay, in this order."""
-        self._points, self._count = self._points[rows], len(rows)
+        self.append(1, points=front_of(keyframe))
 
     def turned(self, front: F64, cam_T_kf: F64) -> I64:
         """Rows whose views overlap with a camera's from another direction, those that should look most alike first.
@@ -83,7 +74,7 @@ class Fronts:
         apart = np.linalg.norm(cam_T_kf[:, :3, 3], axis=1)
         reach = REACH * float(np.median(np.linalg.norm(front, axis=1)))
         rows = np.flatnonzero((cam_T_kf[:, 2, 2] < TURNED) & (apart < reach))
-        there, here = self._points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
+        there, here = self.points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
         back = se3.inverse(cam_T_kf[rows])
         overlap = (self._alike(cam_T_kf[rows], there) + self._alike(back, here)) / 2
         order = np.lexsort((rows, -overlap))

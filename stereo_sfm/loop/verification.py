@@ -21,9 +21,9 @@ from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.types import F64, I64, Keyframe
 
 GUIDED = (12.0, 4), (6.0, 10)  # rounds of guided matching: radius of the search in px, maximum of iterations
-FIRST_SHARE = 0.2  # of the required matches that the candidate alone must have
-RANSAC_SHARE = 0.4  # of the required inliers that the pose from three points must already have
-GRID = (8, 6)  # columns, rows
+FIRST_SHARE = 0.2  # of the required matches that the candidate alone must have: the keyframes around it add the rest
+RANSAC_SHARE = 0.4  # of the required inliers that the pose from three points must have: guided matching finds more
+GRID = (8, 6)  # columns, rows of `LoopConfig.min_cells`
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 
 

@@ -12,7 +12,7 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.vocabulary import Vocabulary
 
-VERSION = 1
+VERSION = 1  # of the file's format
 _COLUMNS = ("centroids", "first_child", "child_count", "word", "idf")
 
 

@@ -7,8 +7,6 @@ must agree with one pose.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
@@ -16,25 +14,44 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.mapping import map_kernels
-from stereo_sfm.mapping.culling import OF_A_VIEW
+from stereo_sfm.mapping.culling import OF_A_VIEW, SAME_VIEW_DEPTHS
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
-from stereo_sfm.types import F64, I64, U8, Bool
-
-MATCH_HUBER = 1.5  # sigmas where the loss of a match becomes linear
+from stereo_sfm.types import F64, I64, Bool, Keyframe
 
 
-@dataclass(frozen=True, eq=False)
-class Sightings:
-    """Observations of a keyframe, one row each."""
+def find_again(
+    map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, usable: Bool, pose: F64, config: MapperConfig
+) -> I64:
+    """Points of the map that a keyframe sees again: (M, 2) its rows and those of the points.
 
-    uv_left: F64  # (N, 2) px
-    uv_right: F64  # (N, 2) px, NaN where unseen
-    descriptors: U8  # (N, 32)
+    Args:
+        rows: (N,) point row of each of its tracks, -1 if new. usable: (N,). pose: (4, 4) map_T_kf.
+    """
+    tracked = rows[usable & (rows >= 0)]
+    depth = np.linalg.norm(keyframe.points_cam, axis=1)
+    reach = 2 * SAME_VIEW_DEPTHS * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
+    around = _local_keyframes(map_, tracked, pose, reach, config)
+    points, left, right = _points_in_view(map_, rig, around, pose)
+    followed = np.zeros(len(map_.points), bool)
+    followed[tracked] = True
+    other = ~followed[points]
+    followed[points] = True
+    map_.points.expected[followed] += 1
+    points = points[other]
+    words = as_words(np.where(usable[:, None], keyframe.descriptors, 0).astype(np.uint8))
+    pairs = map_kernels.match_near(
+        keyframe.uv_left, keyframe.uv_right, words, left[other], right[other], as_words(map_.descriptors_of(points)),
+        config.match_radius_px, config.match_distance_bits, config.match_ratio,
+    )  # fmt: skip
+    mine = np.flatnonzero(pairs >= 0)
+    points = points[pairs[mine]]
+    good = _agreeing(rig, pose, map_.points.xyz[points], keyframe.uv_left[mine], keyframe.uv_right[mine], config)
+    return np.stack([mine[good], points[good]], 1)
 
 
-def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, config: MapperConfig) -> I64:
+def _local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, config: MapperConfig) -> I64:
     """Rows of keyframes whose points may be in view.
 
     Args:
@@ -53,7 +70,7 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     return np.unique(np.concatenate([first, *second, near]).astype(np.int64))
 
 
-def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
+def _points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
     """Points of keyframes visible from this pose at a similar angle and distance: rows, left and right px or NaN."""
     points = map_.points
     rows = map_.points_of_keyframes(keyframes)
@@ -69,27 +86,14 @@ def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[
     return rows[visible], uv_left[visible], uv_right[visible]
 
 
-def match(
-    sightings: Sightings, predicted_left: F64, predicted_right: F64, descriptors: U8, config: MapperConfig
-) -> tuple[I64, I64]:
-    """Mutually best (sighting, candidate) pairs within the search radius and the descriptor distance."""
-    pairs = map_kernels.match_near(
-        sightings.uv_left, sightings.uv_right, as_words(sightings.descriptors),
-        predicted_left, predicted_right, as_words(descriptors),
-        config.match_radius_px, config.match_distance_bits, config.match_ratio,
-    )  # fmt: skip
-    found = np.flatnonzero(pairs >= 0)
-    return found, pairs[found]
-
-
-def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> Bool:
+def _agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> Bool:
     """Which matches (N,) agree with one pose near the given one; none if too few do."""
     count = len(xyz)
     none = np.zeros(count, bool)
     if count < config.match_min:
         return none
-    sigma = np.full(count, config.match_sigma_px)
-    _, inlier = adjust_pose(rig, map_T_kf, xyz, uv_left, uv_right, sigma, MATCH_HUBER)
+    sigma, huber = np.full(count, config.match_sigma_px), 2 * config.huber_sigmas  # without the bias of tracks at edges
+    _, inlier = adjust_pose(rig, map_T_kf, xyz, uv_left, uv_right, sigma, huber)
     good = inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
     if good.sum() < max(config.match_min, 0.5 * count):
         return none

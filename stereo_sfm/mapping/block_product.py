@@ -11,6 +11,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+# Types of the compiler: a number of an entry, six entries, six numbers of entries.
 INDEX, ROW, FIRST = ir.IntType(64), ir.VectorType(ir.DoubleType(), 6), ir.VectorType(ir.IntType(32), 6)
 
 

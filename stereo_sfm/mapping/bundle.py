@@ -17,6 +17,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping import bundle_kernels as kernels
@@ -26,12 +27,13 @@ from stereo_sfm.mapping.reduced import ReducedSystem
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, I64, Bool
 
-LONGEST_STEP = 32.0  # of those that `BundleConfig.extend` tries, in steps of Gauss-Newton
-LEAST_SQUARES = 100.0  # scale of Cauchy's loss, over the variance, from which all weights are one
-MEDIAN_CHI2 = 2.0 * float(np.log(2.0))  # of two dimensions
-TO_SIGMA = 1.4826  # from the median of absolute values, for normally distributed ones
-MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual
-MIN_DISPARITY_SIGMA = 1e-2  # of normalised mean disparity errors
+LONGEST_STEP = 32.0  # steps of Gauss-Newton that `BundleConfig.extend` tries at once: five doublings, then a new system
+LEAST_SQUARES = 100.0  # squared scale of Cauchy's loss over twice the variance: the mean weight is one within a percent
+MEDIAN_CHI2 = 2.0 * float(np.log(2.0))  # sigmas^2, of two dimensions
+TO_SIGMA = 1.4826  # from the median of absolute values, of normally distributed ones: 1 / Phi^-1(3/4)
+CHI2_2DOF_99 = chi_squared(0.99, 2)  # sigmas^2, of a pixel: one of a hundred right ones is left out
+MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual: exact data have none, and a scale of zero
+MIN_DISPARITY_SIGMA = 1e-2  # sigmas, the same of the points' mean disparity errors
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
 
@@ -45,7 +47,7 @@ class BundleConfig:
     cauchy: float = 0.0  # median residuals, the scale of Cauchy's loss in all rounds but the first; 0: Huber's
     disparity_sigmas: float = 0.0  # mean error of a point's stereo matches beyond which they count less; 0: never
     joint_loss: bool = False  # one loss over both images of an observation instead of one each
-    outlier_chi2: float = 9.21  # squared normalised residual in one image that makes an outlier (99 % of 2 dof)
+    outlier_chi2: float = CHI2_2DOF_99  # squared normalised residual in one image that makes an outlier
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
     damping: float = 1e-4  # first damping, relative to the diagonal
     fixed_once: bool = False  # observations of fixed keyframes are linearised once a round, not after every step

@@ -9,6 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 
 Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
 SPARE = 4  # one spare row for so many in use: rows are copied four times on the way, and little memory is unused
+FEW = 512  # rows that are not worth to be freed: tens of kilobytes
 
 
 def column(dtype: DTypeLike, default: Any, shape: tuple[int, ...] = ()) -> Any:
@@ -62,6 +63,10 @@ class Columns:
             self._data[name] = kept
         self._count = len(rows)
         self._show()
+
+    def much_unused(self, used: int) -> bool:
+        """Whether more rows than are spared for growth anyway, and not only a few, are not among those `used`."""
+        return len(self) > used + used // SPARE + FEW
 
     @property
     def nbytes(self) -> int:

@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.mapping.averaging import average_correction
 from stereo_sfm.mapping.level import weights
 from stereo_sfm.mapping.map import Map
@@ -24,12 +25,13 @@ from stereo_sfm.mapping.pose_graph import Edges, Gravity, edges_of_poses, join, 
 from stereo_sfm.mapping.side_points import join_corners
 from stereo_sfm.types import F64, I64, LoopResult
 
-COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph
-ODOMETRY = 0.004, 0.0006  # standard deviation of an odometry edge: metres and radians per metre
-MAX_STRAIN = 6.0  # squared error in sigmas that a loop may keep: chi-squared of six degrees of freedom has this mean
-MAX_NOISE = 12.6  # squared error in sigmas that noise exceeds in one of twenty loops
-DRIFT = 0.003, 0.0003  # systematic drift of scale and heading: metres and radians per metre of the path
-LOOP_SIGMAS = 0.01, 0.003  # smallest standard deviation of a loop: metres, radians
+COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph: as many as a loop must have
+# Standard deviation of an odometry edge, metres and radians per metre, of good tracking; and its systematic part.
+ODOMETRY = 0.004, 0.0006
+MAX_STRAIN = 6.0  # sigmas^2 that a loop may keep: chi-squared of six degrees of freedom has this mean
+MAX_NOISE = chi_squared(0.95, 6)  # sigmas^2: noise exceeds that in one of twenty loops
+DRIFT = 0.003, 0.0003  # of scale and heading: metres and radians per metre of the path
+LOOP_SIGMAS = 0.01, 0.003  # metres, radians, smallest standard deviation of a loop: its points are not independent
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,12 +11,13 @@ from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-OTHERS = 3  # keyframes that observe a point, beyond which one more is redundant
+OTHERS = 3  # keyframes that observe a point, beyond which one more is redundant (ORB-SLAM, TRO 31, 2015, section VI-E)
 # Keyframes that stay of those that see the same, in the map and among the loop closer's candidates: they bound memory
 # and time where the robot does not leave a place.
 OF_A_VIEW, OF_EARLIER_VISITS = 5, 300  # of one view; besides, of all views that earlier visits had
 PASSED = 30  # newest keyframes, which are not counted yet: the camera may still be there
-SAME_VIEW_DEPTHS, SAME_VIEW_DEG = 0.15, 15.0  # keyframes of the same view: distance in median depths, angle
+# Keyframes of the same view: distance in median depths, angle. Most of what one sees, the other sees.
+SAME_VIEW_DEPTHS, SAME_VIEW_DEG = 0.15, 15.0
 
 
 def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfig) -> I64:

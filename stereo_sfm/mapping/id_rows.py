@@ -1,12 +1,9 @@
 """Rows of a table by id, for ids that are known for a while and then forgotten."""
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
-
 from __future__ import annotations
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import I32, I64, Bool
 
 
@@ -30,7 +27,8 @@ class IdRows:
     def add(self, ids: I64, rows: I64) -> None:
         """Add unknown ids (N,), each of them once, with their rows (N,)."""
         order = np.argsort(ids)
-        self.ids, self.rows = _merge(self.ids, self.rows, ids[order], rows[order])
+        at = np.searchsorted(self.ids, ids[order])
+        self.ids, self.rows = np.insert(self.ids, at, ids[order]), np.insert(self.rows, at, rows[order])
 
     def keep(self, known: Bool) -> None:
         """Forget all ids but those marked (N,)."""
@@ -40,19 +38,3 @@ class IdRows:
     def nbytes(self) -> int:
         """Bytes of both arrays."""
         return self.ids.nbytes + self.rows.nbytes
-
-
-@njit
-def _merge(ids, rows, new_ids, new_rows):
-    """Both ascending lists of ids as one, with their rows."""
-    n, m = len(ids), len(new_ids)
-    out_ids, out_rows = np.empty(n + m, np.int64), np.empty(n + m, np.int32)
-    i = j = 0
-    for k in range(n + m):
-        if j == m or (i < n and ids[i] < new_ids[j]):
-            out_ids[k], out_rows[k] = ids[i], rows[i]
-            i += 1
-        else:
-            out_ids[k], out_rows[k] = new_ids[j], new_rows[j]
-            j += 1
-    return out_ids, out_rows

@@ -2,66 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping import association
-from stereo_sfm.mapping.culling import SAME_VIEW_DEPTHS
-from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.association import find_again
+from stereo_sfm.mapping.map import POSE_POINTS, Map
 from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
-MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before insertion
-# With fewer that agree with it, odometry, which has all tracked points, knows the pose better than the map.
-FEW_POINTS = 30
 
-
-@dataclass(frozen=True, eq=False)
-class Insertion:
-    """The result of `insert_keyframe`."""
-
-    row: int  # of the keyframe
-    fused: list[tuple[int, int]]  # point rows (removed, the one that replaced it)
-
-
-def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config: MapperConfig) -> Insertion:
+def insert_keyframe(
+    map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config: MapperConfig
+) -> tuple[int, list[tuple[int, int]]]:
     """Insert a keyframe with its points.
 
     Args:
         guess: (4, 4) map_T_kf by odometry.
+
+    Returns:
+        Its row, and rows of fused points (removed, the one that replaced it).
     """
     rows, usable = _identify(map_, keyframe, config)
     pose, agreeing = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
-    few = keyframe.odometry is not None and agreeing < FEW_POINTS
+    # Odometry, which has all tracked points, knows the pose better than few points of the map.
+    few = keyframe.odometry is not None and agreeing < 2 * config.connected_points
     pose = guess if few else pose
     row = map_.add_keyframe(keyframe, pose, Motion.of(keyframe, rig.imu, config.sensors, few))
     matches = np.zeros((0, 2), np.int64)
     if config.association == "map":
-        matches = _find_again(map_, rig, keyframe, rows, usable, pose, config)
+        matches = find_again(map_, rig, keyframe, rows, usable, pose, config)
     new = np.flatnonzero(usable & (rows < 0))
-    xyz = se3.transform(pose, np.asarray(keyframe.points_cam)[new])
-    rows[new] = map_.add_points(np.asarray(keyframe.point_ids)[new], xyz, row, config.sigma_px)
+    xyz = se3.transform(pose, keyframe.points_cam[new])
+    rows[new] = map_.add_points(keyframe.point_ids[new], xyz, row, config.sigma_px)
     fused = [pair for i, known in matches.tolist() if (pair := fuse_points(map_, int(rows[i]), known, config))]
-    rows = map_.point_rows(np.asarray(keyframe.point_ids))
+    rows = map_.point_rows(keyframe.point_ids)
     keep = _first_of_each(np.where(usable, rows, -1))
-    map_.observe(
-        row,
-        rows[keep],
-        np.asarray(keyframe.uv_left)[keep],
-        np.asarray(keyframe.uv_right)[keep],
-        np.asarray(keyframe.descriptors)[keep],
-    )
-    return Insertion(row, fused)
+    map_.observe(row, rows[keep], keyframe.uv_left[keep], keyframe.uv_right[keep], keyframe.descriptors[keep])
+    return row, fused
 
 
 def _identify(map_: Map, keyframe: Keyframe, config: MapperConfig) -> tuple[I64, Bool]:
     """(N,) point row of each track, -1 if new, and (N,) which may be used: tracks of culled points may not."""
-    rows = map_.point_rows(np.asarray(keyframe.point_ids))
+    rows = map_.point_rows(keyframe.point_ids)
     usable = (rows < 0) | map_.points.alive[np.maximum(rows, 0)] if len(map_.points) else np.ones(len(rows), bool)
     usable &= np.isfinite(keyframe.uv_left).all(axis=1)
     if config.association == "previous" and len(map_.keyframes):
@@ -77,42 +62,15 @@ def _solve_pose(
     known = known.copy()
     known[known] = np.isfinite(map_.points.xyz[rows[known], 0])
     count = int(known.sum())
-    if count < MIN_POSE_POINTS:
+    if count < POSE_POINTS:
         return guess, 0
     rows = rows[known]
     points, uv_left, uv_right = map_.points, keyframe.uv_left[known], keyframe.uv_right[known]
     sigma = points.sigma[rows].astype(float)
     pose, inlier = adjust_pose(rig, guess, points.xyz[rows], uv_left, uv_right, sigma, config.huber_sigmas)
-    if inlier[:, 0].sum() < max(MIN_POSE_POINTS, count // 2):
+    if inlier[:, 0].sum() < max(POSE_POINTS, count // 2):
         return guess, 0
     return pose, int(np.count_nonzero(inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))))
-
-
-def _find_again(
-    map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, usable: Bool, pose: F64, config: MapperConfig
-) -> I64:
-    """(M, 2) pairs (row of the keyframe, point row) that match by descriptor near the point's projection."""
-    tracked = rows[usable & (rows >= 0)]
-    depth = np.linalg.norm(keyframe.points_cam, axis=1)
-    reach = 2 * SAME_VIEW_DEPTHS * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
-    around = association.local_keyframes(map_, tracked, pose, reach, config)
-    points, uv_left, uv_right = association.points_in_view(map_, rig, around, pose)
-    followed = np.zeros(len(map_.points), bool)
-    followed[tracked] = True
-    other = ~followed[points]
-    followed[points] = True
-    map_.points.expected[followed] += 1
-    points, uv_left, uv_right = points[other], uv_left[other], uv_right[other]
-    sightings = association.Sightings(
-        np.asarray(keyframe.uv_left),
-        np.asarray(keyframe.uv_right),
-        np.where(usable[:, None], keyframe.descriptors, 0).astype(np.uint8),
-    )
-    mine, found = association.match(sightings, uv_left, uv_right, map_.descriptors_of(points), config)
-    good = association.agreeing(
-        rig, pose, map_.points.xyz[points[found]], sightings.uv_left[mine], sightings.uv_right[mine], config
-    )
-    return np.stack([mine[good], points[found[good]]], 1)
 
 
 def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tuple[int, int] | None:

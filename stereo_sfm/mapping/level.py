@@ -14,7 +14,7 @@ import numpy as np
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-HUBER = 2.0  # sigmas where the loss becomes linear
+HUBER = 2.0  # sigmas where the loss becomes linear: of one of twenty right ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,8 @@ def level_of(map_: Map, rows: I64, fixed: Bool) -> Level | None:
     others[rows[~fixed]] = False
     still = np.flatnonzero(others)
     rest = np.zeros((len(submaps), 3))
-    np.add.at(rest, group[still], weight[still, None] * _in_map(map_, still))
+    in_map = np.einsum("nij,nj->ni", table.map_T_kf[still, :3, :3], table.down[still])
+    np.add.at(rest, group[still], weight[still, None] * in_map)
     return Level(table.down[rows].copy(), weight[rows], group[rows], rest)
 
 
@@ -83,8 +84,3 @@ def mean_down(map_T_kf: F64, down: F64, sigma: F64) -> F64:
     total = (weights(sigma)[:, None] * np.einsum("nij,nj->ni", map_T_kf[:, :3, :3], down)).sum(axis=0)
     size = float(np.linalg.norm(total))
     return total / size if size > 0 else total
-
-
-def _in_map(map_: Map, rows: I64) -> F64:
-    """(N, 3) directions in the map as keyframes measured them."""
-    return np.einsum("nij,nj->ni", map_.keyframes.map_T_kf[rows, :3, :3], map_.keyframes.down[rows])

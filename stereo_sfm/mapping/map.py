@@ -19,10 +19,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.mapping.motions import Motion
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
-from stereo_sfm.types import F32, F64, I64, U8, Bool, Corners, Keyframe
-
-FEW_KEYFRAMES = 256  # forgotten ones whose rows are not worth to be freed
+from stereo_sfm.types import F64, I64, U8, Corners, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,70 +36,7 @@ class MapDelta:
     xyz: F64  # (P, 3)
 
 
-@dataclass(frozen=True, eq=False)
-class MapSnapshot:
-    """The living part of a map as copies: keyframes and points in order of their ids, observations by keyframe."""
-
-    kf_ids: I64  # (K,)
-    frame_ids: I64  # (K,)
-    stamp_ns: I64  # (K,)
-    submap_ids: I64  # (K,)
-    map_T_kf: F64  # (K, 4, 4)
-    down: F64  # (K, 3) see `Keyframe.down`
-    down_sigma: F64  # (K,)
-    pt_ids: I64  # (P,)
-    points: F64  # (P, 3)
-    anchors: I64  # (P,) index into kf_ids
-    seen: I64  # (P,)
-    expected: I64  # (P,)
-    obs_kf: I64  # (M,) index into kf_ids
-    obs_pt: I64  # (M,) index into pt_ids
-    uv_left: F64  # (M, 2) px
-    uv_right: F64  # (M, 2) px
-    descriptors: U8  # (M, 32)
-    corner_kf: I64  # (C,) index into kf_ids, ascending: corners for place recognition, see `Keyframe.corners`
-    corner_uv_left: F32  # (C, 2) px
-    corner_uv_right: F32  # (C, 2) px
-    corner_points: F32  # (C, 3) metres in the keyframe's camera
-    corner_descriptors: U8  # (C, 32)
-    corner_side: Bool  # (C,) those of `Keyframe.sides`, which follow the others of a keyframe
-
-    def keyframes(self) -> list[Keyframe]:
-        """Keyframes as from a tracker, with poses and points of the map."""
-        rows = np.arange(len(self.kf_ids) + 1)
-        seen, corners = np.searchsorted(self.obs_kf, rows), np.searchsorted(self.corner_kf, rows)
-        return [
-            self._keyframe(k, slice(seen[k], seen[k + 1]), slice(corners[k], corners[k + 1]))
-            for k in rows[:-1].tolist()
-        ]
-
-    def _corners(self, rows: slice) -> Corners:
-        return Corners(
-            self.corner_uv_left[rows],
-            self.corner_uv_right[rows],
-            self.corner_points[rows],
-            self.corner_descriptors[rows],
-        )
-
-    def _keyframe(self, k: int, seen: slice, corners: slice) -> Keyframe:
-        points, pose = self.obs_pt[seen], self.map_T_kf[k]
-        sides = corners.stop - int(self.corner_side[corners].sum())
-        return Keyframe(
-            kf_id=int(self.kf_ids[k]),
-            frame_id=int(self.frame_ids[k]),
-            stamp_ns=int(self.stamp_ns[k]),
-            odom_T_cam=pose.copy(),
-            point_ids=self.pt_ids[points],
-            uv_left=self.uv_left[seen],
-            uv_right=self.uv_right[seen],
-            points_cam=(self.points[points] - pose[:3, 3]) @ pose[:3, :3],
-            descriptors=self.descriptors[seen],
-            submap_id=int(self.submap_ids[k]),
-            corners=self._corners(slice(corners.start, sides)),
-            sides=self._corners(slice(sides, corners.stop)),
-            down=self.down[k],
-            down_sigma=float(self.down_sigma[k]),
-        )
+POSE_POINTS = 10  # known points from which a keyframe's pose is solved, three times the least that determine one
 
 
 class Map:
@@ -403,9 +339,8 @@ class Map:
 
     @property
     def many_forgotten(self) -> bool:
-        """Whether a fifth of the rows of keyframes, and not only a few, are of culled ones that nothing names."""
-        table = self.keyframes
-        return int((table.alive | table.named).sum()) < 0.8 * len(table) - FEW_KEYFRAMES
+        """Whether many rows of keyframes are of culled ones that nothing names."""
+        return self.keyframes.much_unused(int((self.keyframes.alive | self.keyframes.named).sum()))
 
     def free_keyframes(self) -> I64:
         """Free the rows of culled keyframes that nothing names; the order of the others stays.
@@ -433,10 +368,10 @@ class Map:
 
     @property
     def much_removed(self) -> bool:
-        """Whether a fifth of the rows of points or observations, and not only a few, are unused."""
+        """Whether many rows of points or observations are unused."""
         living = self.points.alive
         seen = int(self.points.obs_count[living].sum())
-        return len(living) > 1.25 * int(living.sum()) + 512 or len(self.observations) > 1.25 * seen + 4096
+        return self.points.much_unused(int(living.sum())) or self.observations.much_unused(seen)
 
     def compact(self, followed: I64 | None = None) -> I64:
         """Free the rows of removed points and observations; the order of the others stays.

@@ -48,11 +48,13 @@ from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known, sides_share_points
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.level import down_of
-from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.mapping.recalibration import calibration_update, recalibrate
 from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.mapping.sensor_calibration import SensorCalibration
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import (
@@ -68,11 +70,11 @@ from stereo_sfm.types import (
     SensorUpdate,
 )
 
-MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
-FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
-GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
-LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
-RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
+MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment: more hold it
+FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment: fewer are within one window
+GROWTH_AT_KNOWN_LOOP = 1.1  # factor by which the map has grown when a known loop starts a full bundle adjustment
+LAG_SHARE = 0.1  # of the living keyframes, until a result is due: the time of a full adjustment grows with the map
+RECENT = 3  # newest keyframes, whose points are checked and which are never redundant: their points are still tracked
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +92,7 @@ def run_job(job: Job) -> BundleResult:
     return bundle_adjust(job.rig, job.window.bundle, job.config)
 
 
-class Mapper:
+class Mapper(AnyMapper):
     """Owner of the map."""
 
     def __init__(
@@ -109,9 +111,8 @@ class Mapper:
             calibration: estimates corrections of the rig; None: the rig stays.
             sensors: estimates those of IMU and wheels; None: they stay.
         """
-        self._config, self._rig, self._spans = config, rig, spans or NoSpans()
-        self._source_rig, self._calibration = rig, calibration
-        self._terms: F64 = np.zeros(RIG_TERMS)  # corrections so far
+        super().__init__(rig)
+        self._config, self._spans, self._calibration = config, spans or NoSpans(), calibration
         self._revised: CalibrationUpdate | None = None  # for the next update
         self._sensors = sensors
         self._sensor_update: SensorUpdate | None = None  # of this step
@@ -200,11 +201,8 @@ class Mapper:
         return self._update(int(self.map.keyframes.kf_id[-1]))
 
     def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
-        none = np.zeros(0, np.int64)
-        return MapUpdate(
-            self._version, keyframe.kf_id, np.array([keyframe.kf_id]), np.array([keyframe.odom_T_cam]), none,
-            np.zeros((0, 3)), none, np.zeros((0, 2), np.int64), np.eye(4), sensors=self._sensor_update,
-        )  # fmt: skip
+        kf_id, pose = keyframe.kf_id, keyframe.odom_T_cam
+        return MapUpdate(self._version, kf_id, np.array([kf_id]), np.array([pose]), sensors=self._sensor_update)
 
     def _update(self, kf_id: int) -> MapUpdate:
         delta = self.map.take_delta()
@@ -241,16 +239,6 @@ class Mapper:
 
     # -- calibration -------------------------------------------------------------------------------------------------
 
-    @property
-    def rig(self) -> Rig:
-        """The rig of the map, with the corrections estimated so far."""
-        return self._rig
-
-    @property
-    def calibration(self) -> tuple[Rig, F64]:
-        """The rig as the run began, and the terms (8,) that make it that of the map."""
-        return self._source_rig, self._terms
-
     def _calibrate_sensors(self, keyframe: Keyframe) -> None:
         """Compare IMU and wheels with the poses by the images, where that is asked for."""
         if self._sensors is not None:
@@ -269,12 +257,12 @@ class Mapper:
             self._terms = revision.terms
             changes = [*revision.on_the_way, (revision.since_kf_id, revision.terms)]
             rigs = [(self.map.kf_row(since), with_terms(self._source_rig, terms)) for since, terms in changes]
-            recalibrate(self.map, [(0, self._rig), *rigs])
-            self._rig = rigs[-1][1]
+            recalibrate(self.map, [(0, self.rig), *rigs])
+            self.rig = rigs[-1][1]
             self._adjust_since(rigs[0][0])
             self._start_full_bundle()
             if self._rows is not None:
-                self._rows.use(self._rig)
+                self._rows.use(self.rig)
 
     def _adjust_since(self, first: int) -> None:
         """Adjust the keyframes from a row on at once: the tracker's next poses are solved with their points.
@@ -283,8 +271,8 @@ class Mapper:
         """
         before, config = self.map.keyframes.map_T_kf[-1].copy(), self._config
         most = config.window_keyframes + config.fixed_keyframes
-        part = window.newest(self.map, first, most, config, self._rig.imu)
-        window.write_back(self.map, part, bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config)))
+        part = window.newest(self.map, first, most, config, self.rig.imu)
+        window.write_back(self.map, part, bundle_adjust(self.rig, part.bundle, window.bundle_config(self._config)))
         self._follow_newest(before)
 
     # -- loops -------------------------------------------------------------------------------------------------------
@@ -321,7 +309,7 @@ class Mapper:
         self._cull_loose()
         part = window.whole_map(self.map)
         config = config or window.bundle_config(self._config)
-        self._job = Job(self._rig, config, part, len(self.map.keyframes) - 1)
+        self._job = Job(self.rig, config, part, len(self.map.keyframes) - 1)
         self._job_taken, self._result = False, None
         lag = max(self._config.full_ba_lag_keyframes, round(LAG_SHARE * len(self.map.living_keyframes())))
         self._job_due = len(self.map.keyframes) + lag
@@ -364,35 +352,20 @@ class Mapper:
 
     @property
     def job_due(self) -> bool:
-        """Whether the next `step` applies the result of the job in the background."""
         return self._job is not None and len(self.map.keyframes) >= self._job_due
 
     def pending_job(self) -> Job | None:
-        """The full bundle adjustment to compute, returned once."""
         if self._job is None or self._job_taken:
             return None
         self._job_taken = True
         return self._job
 
     def finish_job(self, result: BundleResult) -> None:
-        """Deliver the result of the job taken last; it is applied when it is due, not before."""
         self._result = result
 
     def snapshot(self) -> MapSnapshot:
         """The living map."""
         return self.map.snapshot()
-
-    @property
-    def found(self) -> bool:
-        """Never: this mapper began with no saved map."""
-        return False
-
-    def relocalize(self) -> None:
-        """Nothing: this mapper began with no saved map."""
-
-    def place(self) -> LoopResult | None:
-        """Nowhere: this mapper began with no saved map."""
-        return None
 
     def _apply_job(self) -> None:
         assert self._job is not None
@@ -414,12 +387,12 @@ class Mapper:
 
     def _insert(self, keyframe: Keyframe) -> int:
         guess = self._map_T_odom @ keyframe.odom_T_cam
-        insertion = insert_keyframe(self.map, self._rig, keyframe, guess, self._config)
-        self._fused += insertion.fused
+        row, fused = insert_keyframe(self.map, self.rig, keyframe, guess, self._config)
+        self._fused += fused
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):
             self._follow_newest(guess)  # what the rig before it measured since the last keyframe is wrong
             self._rig_terms = keyframe.rig_terms
-        return insertion.row
+        return row
 
     def _adjust(self, row: int) -> None:
         if row == 0:
@@ -427,10 +400,10 @@ class Mapper:
         seen = self.map.seen_by(row)
         count = self.map.points.obs_count[seen]
         recent = seen[(count > 1) & (count <= MAX_TRIANGULATED)]
-        self.map.move_points(recent, triangulate(self.map, self._rig, recent))
-        part = window.covisible_window(self.map, row, self._config, self._rig.imu)
+        self.map.move_points(recent, triangulate(self.map, self.rig, recent))
+        part = window.covisible_window(self.map, row, self._config, self.rig.imu)
         self._adjusted = part.pt_rows
-        result = bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config))
+        result = bundle_adjust(self.rig, part.bundle, window.bundle_config(self._config))
         window.write_back(self.map, part, result)
 
     def _cull(self, row: int) -> None:
@@ -450,7 +423,7 @@ class Mapper:
             else:
                 self._loops = [x for x in self._loops if int(self.map.keyframes.kf_id[gone]) not in _ends(x)]
         rows = np.unique(np.concatenate([self._adjusted, self._thin, *seen]))
-        weak = culling.weak_points(self.map, self._rig, rows, row, self._config)
+        weak = culling.weak_points(self.map, self.rig, rows, row, self._config)
         self.map.cull_points(weak)
         self._culled.append(weak)
         points = self.map.points

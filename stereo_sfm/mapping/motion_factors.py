@@ -19,14 +19,16 @@ from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownV
 
 from stereo_sfm.calib.imu import TURN_SHARE, Imu
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool, MotionLink
 
-INERTIAL_CHI2, POSE_CHI2 = 21.7, 16.8  # of nine and six: a motion beyond (1 % of right ones) counts less
-FIRST_ROUND = 10.0  # times as much is allowed before the poses are adjusted
-SPEED_SIGMA = 10.0  # m/s, where the tracker does not know the velocity
-STATE = 9  # velocity in the map, biases of accelerometer and gyroscope
+# Sigmas^2 beyond which a motion counts less: 1 % of right ones.
+INERTIAL_CHI2, POSE_CHI2 = chi_squared(0.99, 9), chi_squared(0.99, 6)
+FIRST_ROUND = 10.0  # times as much is allowed before the poses are adjusted: until then it is they that may be wrong
+SPEED_SIGMA = 10.0  # m/s, where the tracker does not know the velocity: more than any robot's, as if nothing were known
+STATE = 9  # numbers: velocity in the map, biases of accelerometer and gyroscope
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import Preintegrated, preintegrate
 from stereo_sfm.types import F64, Keyframe, MotionLink
 
-LONGEST_S = 10.0  # of a motion: a longer one says little
+LONGEST_S = 10.0  # seconds of a motion by the IMU: its positions drift with the square of the time, and say little then
 
 
 @dataclass(frozen=True, eq=False)

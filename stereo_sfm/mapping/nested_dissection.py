@@ -18,9 +18,9 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from stereo_sfm.types import I64
 
-LEAF = 40  # keyframes that are not divided any further
-BALANCE = 0.2  # share of the nodes that either part should have at least
-SWEEPS = 3  # searches for a node at the border of the graph
+LEAF = 40  # keyframes that are not divided any further: large enough for LAPACK
+BALANCE = 0.2  # share of the nodes that either part should have at least, so that the depth stays logarithmic
+SWEEPS = 3  # searches for a node at the border of the graph, each from the farthest node of the one before
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ that holds their roll and pitch: four degrees of freedom are left to drift.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,12 +16,13 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.types import F64, I64, Bool
 
 ROBUST = ("gnc", "switchable", "none")
-CHI2_6DOF_99 = 16.81
-HELD = 1e-6  # metres, radians: standard deviation of a pose that stays
-TILT = 0.05  # radians, that of its roll and pitch where gravity is known
+CHI2_6DOF_99 = chi_squared(0.99, 6)  # sigmas^2, of a loop from which its weight falls below one
+HELD = 1e-6  # metres, radians: standard deviation of a pose that stays, far below that of any edge
+TILT = 0.05  # radians, that of its roll and pitch where gravity is known: far above gravity's
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,13 +60,7 @@ class PoseGraphResult:
 
 def join(edges: list[Edges]) -> Edges:
     """All edges, in order."""
-    return Edges(
-        np.concatenate([e.i for e in edges]),
-        np.concatenate([e.j for e in edges]),
-        np.concatenate([e.i_T_j for e in edges]),
-        np.concatenate([e.sigmas for e in edges]),
-        np.concatenate([e.loop for e in edges]),
-    )
+    return Edges(*(np.concatenate([getattr(e, f.name) for e in edges]) for f in dataclasses.fields(Edges)))
 
 
 def edges_of_poses(poses: F64, i: I64, j: I64, metres_per_metre: float, radians_per_metre: float) -> Edges:

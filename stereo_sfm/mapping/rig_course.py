@@ -18,13 +18,14 @@ from stereo_sfm.calib.choice import Estimate
 from stereo_sfm.mapping.rig_window import PRIOR, RigWindow
 from stereo_sfm.types import F64, RIG_TERMS, Bool
 
-ITERATIONS = 12  # of expectation-maximisation
+ITERATIONS = 12  # of expectation-maximisation, until the scatter hardly changes
 PRIOR_WINDOWS = 8.0  # as many windows as what is expected of their scatter at first counts for
-ALIKE, MOST_ALIKE = 0.3, 0.9  # correlation of neighbouring windows before they show theirs; the most that is estimated
+# Correlation of neighbouring windows before they show theirs; the most that is estimated: deviations stay finite.
+ALIKE, MOST_ALIKE = 0.3, 0.9
 # Prior standard deviation of what a turn adds, radian and ratio per radian: errors of lenses bend the flow of a turning
 # camera as errors of disparity do, and hardly move rows. The root mean square of eight real recordings.
 BY_TURN = np.array([3e-4, 1.5e-3, 7e-4, 3e-4, 3e-4, 2e-3, 3e-4, 3e-4])
-RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
+RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second: of temperature
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,18 +25,19 @@ from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
 from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
 
-MIN_POINTS = 20
-MAX_POINTS = 160
-STEPS = 4  # of Gauss-Newton
-DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives
-NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
-LENGTHENING = 1, 5, 6, 7  # terms that trade lengths with one another: rotation about y, those of lenses
-# Prior standard deviations of the terms: radians, radians, ratio, radians.
+# Of a window: so many leave seven rows for each of its unknowns; more say little, as windows have errors of their own.
+MIN_POINTS, MAX_POINTS = 20, 160
+STEPS = 4  # of Gauss-Newton: two that find what does not fit, two without it
+DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandths of a pixel
+NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit
+LENSES = slice(5, 8)  # focal ratio and decentering
+LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these
+# Prior standard deviations of the terms, radians, radians, ratio, radians: wide enough for a knock of half a degree.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
 # Prior standard deviations of `_shapes`, px at the image's border.
 LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
-SHARED_PRIOR = np.concatenate([PRIOR, LENS_PRIOR]) ** -2  # information
+SHARED_PRIOR = np.concatenate([PRIOR, LENS_PRIOR]) ** -2  # information, of both
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,9 +14,9 @@ from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, Keyframe, RowErrors
 
-GRID = (3, 4)  # rows and columns of regions
-FAST_SHARE, SLOW_SHARE = 0.2, 0.04  # weight of the newest keyframe in the averages
-MIN_MATCHES = 5  # of a region
+GRID = (3, 4)  # rows and columns of regions: a turn of a camera and an error of its lens look different in them
+FAST_SHARE, SLOW_SHARE = 0.2, 0.04  # weight of the newest keyframe in the averages: over about 5 and 25 keyframes
+MIN_MATCHES = 5  # of a region, whose median two wrong ones then do not decide
 # Of the systematic part, the larger one of the two: matches are lost from 1 px on, and the same small turn of a camera
 # is many pixels of a long lens. Half a pixel is 0.05 degrees at a focal length of 573 px.
 WARN_PX, WARN_DEG = 0.5, 0.05

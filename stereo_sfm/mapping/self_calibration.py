@@ -24,39 +24,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Choice, Estimate, choose, significant
+from stereo_sfm.calib.choice import NAMES, SCALES, SIGMAS, UNITS, Choice, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_course import Scatter, constant, steady
-from stereo_sfm.mapping.rig_window import RigWindow, SeenPoints, solve_window
+from stereo_sfm.mapping.rig_window import LENSES, RigWindow, SeenPoints, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
 OF_ROTATION = np.arange(RIG_TERMS) < 3  # of the right camera
-OF_LENSES = slice(5, 8)  # focal ratio and decentering
-KEYFRAMES = 4  # of one window
-MIN_KEYFRAMES = 3  # of the last window
-MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
-MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
-MIN_WINDOWS = 2  # before the first correction
-FIRST_KEYFRAMES = 2  # from which a first error is corrected that both halves of their points show
-INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])  # windows that each term needs: in the order in which cameras err
-ENOUGH_WINDOWS = 4  # for halves of two windows each
-MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
-MAX_WINDOWS = 80  # used, the newest
-TURNED_KEYFRAMES = 4  # for which a rotation that the tracker noticed must stay the same: as many as a window has
-DRIFT_WINDOWS = 8  # needed to detect drift
-SIGMAS = 4.0  # significance of the first term that is corrected, and of drift
+KEYFRAMES = 4  # of one window, the last one may have one less; a rotation that the tracker noticed stays for as many
+# Share of the image's width that common points move (median) between keyframes of a window: less says little.
+MIN_MOTION = 0.02
+MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case: near ones left the view
+MIN_WINDOWS = 2  # before the first correction: one for each half
+FIRST_KEYFRAMES = 2  # the fewest of a window: a first error is corrected that both halves of their points show
+# Windows that each term needs, in the order in which cameras err: rotation, baseline and focal length, decentering.
+INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
+# For halves of two windows each, twice as many for drift, of which two are unknown. As many as there are, but no more
+# than these, come from one revision to the next.
+ENOUGH_WINDOWS = 4
+MAX_WINDOWS = 80  # used, the newest: what changes slowly is followed
 # Of others, once the calibration is known to be wrong: Akaike's criterion, but for those by which cameras err least.
 FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [3, 4, 6, 7]), SIGMAS, np.sqrt(2.0))
 REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
+# Standard deviations, of one in 370 by chance and of one in 44 (one-sided):
 HUNTING_SIGMAS = 3.0  # by which a refinement moves a term that is taken back unless it is still significant
 HELPING_SIGMAS = 2.0  # by which a correction makes windows better that it was not estimated from
 MISLED_SHARE = 0.05  # of a rig's error that remains in what is estimated from points tracked with it
-MATCHING_PX = 0.02  # systematic error of matching, of all windows
+MATCHING_PX = 0.02  # px, systematic error of matching, which all windows share
 # Bias of the terms of lenses, px at the border over the noise of a pixel: distances are a nonlinear function of pixels.
 BIAS_SHARE = 0.5
-WINDOW_PX = 0.05  # that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
-DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: matching errors that depend on distance
+WINDOW_PX = 0.05  # px, that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
+DIRECTION = np.deg2rad(0.15)  # radians, systematic error of the baseline's direction: of matching, by distance
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +125,7 @@ class SelfCalibration:
 
     def finish(self) -> Revision | None:
         """After the last keyframe: a last revision from all windows."""
-        if len(self._keyframes) >= MIN_KEYFRAMES:
+        if len(self._keyframes) >= KEYFRAMES - 1:
             self._close_window()
         return self._revise(refined_sigmas=0.0) if len(self.windows) >= MIN_WINDOWS else None
 
@@ -138,7 +137,7 @@ class SelfCalibration:
     def _floor(self) -> F64:
         """(8,) standard deviations of what all windows share."""
         px = np.full(RIG_TERMS, MATCHING_PX)
-        px[OF_LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
+        px[LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
         return np.minimum(px * self._of_pixel, DIRECTION)
 
     def _beyond(self, terms: F64, found: Estimate) -> Estimate:
@@ -168,7 +167,7 @@ class SelfCalibration:
         windows = list(self.windows)
         drift = self._drift(windows)
         enough = self._corrected.any() or len(windows) >= ENOUGH_WINDOWS
-        self._until_due = min(len(windows), MAX_BETWEEN) if enough else 1
+        self._until_due = min(len(windows), ENOUGH_WINDOWS) if enough else 1
         found = self._change(windows, drift, refined_sigmas)
         if found is None:
             return None
@@ -254,7 +253,7 @@ class SelfCalibration:
         if not np.array_equal(keyframe.right_turn, self._turn):
             self._turn, self._keyframes = keyframe.right_turn, []
             self._turned_kf_id = keyframe.kf_id if self._turn.any() else -1
-        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + TURNED_KEYFRAMES - 1:
+        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + KEYFRAMES - 1:
             return None
         change, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
         change[OF_ROTATION] = self._turn
@@ -285,12 +284,12 @@ class SelfCalibration:
         basis = np.eye(RIG_TERMS)
         length = np.mean([w.length for w in windows], axis=0)
         if self._rig.readout_s == 0 and abs(length[1]) > 1e-9:
-            basis[1, OF_LENSES] = length[OF_LENSES] / length[1]
+            basis[1, LENSES] = length[LENSES] / length[1]
         return basis
 
     def _drift(self, windows: Sequence[RigWindow]) -> _Drift | None:
         """What windows show of terms that change steadily; None if none does."""
-        if len(windows) < DRIFT_WINDOWS:
+        if len(windows) < 2 * ENOUGH_WINDOWS:
             return None
         whole = steady(windows, windows, self._expected)
         if whole.at([0.0, 1.0]).reach < SIGMAS:

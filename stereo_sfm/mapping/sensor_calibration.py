@@ -20,19 +20,18 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, I64, ImuSamples, Keyframe, SensorSamples, SensorUpdate, WheelSamples
 
-WINDOW_S = 60.0  # compared, the last
-FIRST_S, EVERY_S = 15.0, 10.0  # of the first comparison and from one to the next
-SIGMAS = 5.0  # of a first correction
-BETTER = 0.7  # times the standard deviation of a corrected term: it is replaced
+WINDOW_S = 60.0  # seconds compared, the last
+FIRST_S, EVERY_S = 15.0, 10.0  # seconds until the first comparison, and from one to the next
+SIGMAS = 5.0  # standard deviations of a first correction: the samples compared are not independent
+BETTER = 0.7  # times the standard deviation of a corrected term, half its variance: it is replaced
 # Standard deviations from which a term is known, and differences that are left: what images of half the size leave of a
 # true calibration (0.2 degrees about the vertical axis, which only small accelerations show, 0.5 ms), with room.
 IMU_KNOWN = np.append(np.full(3, np.radians(0.3)), 1e-3)
-IMU_LEFT = np.append(np.full(3, np.radians(0.3)), 1e-3)
 # Of `wheel_fit.NAMES`; their time offset stays: how a robot slides in turns looks like one of 15 ms.
 WHEEL_KNOWN = np.array([3e-3, 3e-3, 1e-2, np.radians(0.3), np.radians(0.3), 0.0, 0.03, 0.03])
 WHEEL_LEFT = np.array([5e-3, 5e-3, 3e-2, np.radians(1.0), np.radians(1.0), 0.0, 0.05, 0.05])
-AGREEMENT = 0.7  # of both with the images: less is another sensor's data, or slip
-WRONG_SCALE = 0.05  # of the rates: other units
+AGREEMENT = 0.7  # correlation of both with the images, half of the variance: less is another sensor's data, or slip
+WRONG_SCALE = 0.05  # deviation from one, of the rates: far more than a gyroscope has
 
 
 @dataclass(eq=False)
@@ -72,7 +71,7 @@ class SensorCalibration:
         self._rig = rig
         self._parts: deque[SensorSamples] = deque()
         self._submap_id = 0
-        self._imu, self._wheel = _Terms.of(3, IMU_KNOWN, IMU_LEFT), _Terms.of(1, WHEEL_KNOWN, WHEEL_LEFT)
+        self._imu, self._wheel = _Terms.of(3, IMU_KNOWN, IMU_KNOWN), _Terms.of(1, WHEEL_KNOWN, WHEEL_LEFT)
         self._due_ns = 0
 
     @staticmethod

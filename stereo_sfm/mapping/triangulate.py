@@ -24,7 +24,7 @@ from stereo_sfm.types import F64, I64
 
 TRIALS = 8  # distances tried
 NEAREST, FARTHEST = 4.0, 4000.0  # baselines (a rig with one camera: of 5 cm)
-STEPS = 8
+STEPS = 8  # of Levenberg-Marquardt at most
 
 
 @inlined

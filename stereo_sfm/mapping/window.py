@@ -16,12 +16,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.level import level_of
-from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.map import POSE_POINTS, Map
 from stereo_sfm.mapping.motion_factors import motion_factors
 from stereo_sfm.types import F64, I64, Bool
-
-FINAL_ROUNDS = 4  # of the last full bundle adjustment, whose weights are to converge
-MIN_SHARED_POINTS = 10  # that connect two keyframes
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +46,14 @@ def bundle_config(config: MapperConfig) -> BundleConfig:
 def final_bundle_config(config: MapperConfig) -> BundleConfig:
     """Those of the last full bundle adjustment.
 
-    It converges, also in the weights and in the scale, which is slow. With one loss over both images: where a match
-    disagrees, because its window shows two surfaces, the pixel of the left image is no better. (During the run the
-    right images may all disagree for a while, after a knock, and the left ones hold the map together.)
+    It converges, also in the weights, for which it has twice as many rounds, and in the scale, which is slow. With one
+    loss over both images: where a match disagrees, because its window shows two surfaces, the pixel of the left image
+    is no better. (During the run the right images may all disagree for a while, after a knock, and the left ones hold
+    the map together.)
     """
+    usual = bundle_config(config)
     return dataclasses.replace(
-        bundle_config(config), rounds=FINAL_ROUNDS, iterations=config.final_iterations, joint_loss=True, extend=True
+        usual, rounds=2 * usual.rounds, iterations=config.final_iterations, joint_loss=True, extend=True
     )
 
 
@@ -134,7 +133,7 @@ def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
     for first in np.flatnonzero(~fixed)[::-1].tolist():
         part, ends, loose = {first}, [first], not held[first]
         while loose and ends:
-            linked = index[map_.neighbours(int(kfs[ends.pop()]), MIN_SHARED_POINTS)[0]]
+            linked = index[map_.neighbours(int(kfs[ends.pop()]), POSE_POINTS)[0]]
             linked = linked[linked >= 0]
             loose = not held[linked].any()
             ends += [i for i in linked.tolist() if i not in part]

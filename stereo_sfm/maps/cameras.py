@@ -19,10 +19,11 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, RIG_TERMS
 
 KEY = "stereo_sfm_map_cameras"
-SAME_PX = 1e-3  # difference of focal lengths and principal points that is not worth a word
-SAME_SHARE = 1e-4  # of the baseline, likewise
-SAME_DEG = 1e-3  # likewise
-# What self-calibration may change of a rig: degrees, shares of the baseline and of the right focal length.
+# Differences that are not worth a word, below what any calibration knows: px of focal lengths and principal points,
+# share of the baseline, degrees.
+SAME_PX, SAME_SHARE, SAME_DEG = 1e-3, 1e-4, 1e-3
+# What self-calibration may change of a rig, about a standard deviation of its prior (`rig_window.PRIOR`): degrees,
+# shares of the baseline and of the right focal length.
 CORRECTED_DEG, CORRECTED_SHIFT, CORRECTED_FOCAL = 0.6, 0.02, 0.01
 
 
@@ -46,24 +47,13 @@ class MapCamera:
 
 def unified(rigs: Sequence[Rig]) -> list[Rig]:
     """The rigs in their order, with one object for those whose cameras are the same to the bit: the first of them."""
-    known: list[Rig] = []
-    out: list[Rig] = []
-    for rig in rigs:
-        same = next((k for k in known if k is rig or _same_bits(k, rig)), None)
-        if same is None:
-            known.append(rig)
-        out.append(rig if same is None else same)
-    return out
+    known: dict[Any, Rig] = {}
+    return [known.setdefault(_bits(rig), rig) for rig in rigs]
 
 
-def _same_bits(a: Rig, b: Rig) -> bool:
-    cameras = _cameras(a, b)
-    same = all(x is not None and y is not None and _same_lens(x, y) for _, x, y in cameras)
-    return same and a.depth == b.depth and np.array_equal(a.left_T_right, b.left_T_right)
-
-
-def _same_lens(a: Camera, b: Camera) -> bool:
-    return a.model_id == b.model_id and a.size == b.size and np.array_equal(a.params, b.params)
+def _bits(rig: Rig) -> Any:
+    lenses = [None if c is None else (c.model_id, c.size, c.params.tobytes()) for c in (rig.left, rig.right)]
+    return *lenses, rig.depth, rig.left_T_right.tobytes()
 
 
 def _cameras(a: Rig, b: Rig) -> list[tuple[str, Camera | None, Camera | None]]:

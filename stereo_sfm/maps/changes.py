@@ -12,13 +12,13 @@ from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.update import Update
 from stereo_sfm.types import F64, I64, Bool
 
-CELL = 1.0  # metres
+CELL = 1.0  # metres: a section of a shelf
 ENOUGH = 8  # points of the session in a cell that was looked at, of earlier sessions in one that the map knew
 CHANGED = 0.35  # of the usual share of points found again, below which a cell has changed
-SIGMAS = 2.0  # by which it must miss the usual number
-BESIDE_M = 3.0  # metres from an aisle's line to its shelves
+SIGMAS = 2.0  # standard deviations of a count by which it must miss the usual number
+BESIDE_M = 3.0  # metres from an aisle's line to its shelves: wide aisles have four to six
 NEAR_M = 6.0  # metres from a keyframe; points farther away are too uncertain
-VIEWS = 3  # keyframes that see a point that counts
+VIEWS = 3  # keyframes that see a point that counts: one by chance is seen by fewer
 NEW, OTHER = "new", "changed"
 
 

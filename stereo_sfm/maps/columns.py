@@ -3,54 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
-MAX_ID = 1 << 40  # ids count up from 0
-ROTATION_TOLERANCE = 1e-6  # deviation of a rotation from orthonormal
+from stereo_sfm.mapping.snapshot import Column, MapSnapshot
 
+MAX_ID = 1 << 40  # ids count up from 0, a thousand a second for 30 years
+ROTATION_TOLERANCE = 1e-6  # deviation of a rotation from orthonormal: a float32 that somebody wrote has less
 
-@dataclass(frozen=True)
-class Column:
-    """One array of a table; an index column refers to rows of another table."""
-
-    table: str
-    dtype: str
-    shape: tuple[int, ...] = ()  # of one row
-    index: str = ""  # the table it refers to
-    ascending: bool = False
-    unknown: bool = False  # NaN means not observed
-
-
+_HINTS = get_type_hints(MapSnapshot, include_extras=True)
+COLUMNS: dict[str, Column] = {name: hint.__metadata__[0] for name, hint in _HINTS.items()}
+COLUMNS["sessions"] = Column("keyframes", "int64")  # of `SavedMap`
 KEYS = {"keyframes": "kf_ids", "points": "pt_ids", "observations": "obs_kf", "corners": "corner_kf"}  # of each table
-COLUMNS: dict[str, Column] = {
-    "kf_ids": Column("keyframes", "int64", ascending=True),
-    "frame_ids": Column("keyframes", "int64"),
-    "stamp_ns": Column("keyframes", "int64"),
-    "submap_ids": Column("keyframes", "int64"),
-    "map_T_kf": Column("keyframes", "float64", (4, 4)),
-    "down": Column("keyframes", "float64", (3,)),
-    "down_sigma": Column("keyframes", "float64"),
-    "sessions": Column("keyframes", "int64"),
-    "pt_ids": Column("points", "int64", ascending=True),
-    "points": Column("points", "float64", (3,)),
-    "anchors": Column("points", "int64", index="keyframes"),
-    "seen": Column("points", "int64"),
-    "expected": Column("points", "int64"),
-    "obs_kf": Column("observations", "int64", index="keyframes"),
-    "obs_pt": Column("observations", "int64", index="points"),
-    "uv_left": Column("observations", "float32", (2,)),
-    "uv_right": Column("observations", "float32", (2,), unknown=True),
-    "descriptors": Column("observations", "uint8", (32,)),
-    "corner_kf": Column("corners", "int64", index="keyframes"),
-    "corner_uv_left": Column("corners", "float32", (2,)),
-    "corner_uv_right": Column("corners", "float32", (2,), unknown=True),
-    "corner_points": Column("corners", "float32", (3,), unknown=True),
-    "corner_descriptors": Column("corners", "uint8", (32,)),
-    "corner_side": Column("corners", "bool"),
-}
 
 
 def check_columns(arrays: Mapping[str, Any]) -> None:

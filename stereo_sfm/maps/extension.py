@@ -56,6 +56,7 @@ class Extension(Mapper):
             if self._localizer.last is not None and self._localizer.last.found:
                 self._found, self._found_kf = self._localizer.last, (keyframe.kf_id, np.eye(4))
                 self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
+                self.found = True
                 self._misplaced = not np.array_equal(keyframe.rig_terms, self._terms)
                 update = self._with_everything(update)
         if self._saved_T_session is None:
@@ -69,11 +70,6 @@ class Extension(Mapper):
         if update is None or self._saved_T_session is None:
             return update
         return self._in_saved_map(update, self._saved_T_session)
-
-    @property
-    def found(self) -> bool:
-        """Whether a keyframe was relocalized in the saved map."""
-        return self._saved_T_session is not None
 
     def place(self) -> LoopResult | None:
         """The relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.

@@ -9,10 +9,12 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.dominant_direction import dominant_direction
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import F64, Bool
 
 LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
+BELOW_M = 0.2  # metres below the camera at which a floor can be
+THICK_M = 0.05  # metres, of a level: stereo points of a floor a metre or two away scatter by a few centimetres
 
 
 def find_floor(s: MapSnapshot) -> F64:
@@ -26,7 +28,7 @@ def find_floor(s: MapSnapshot) -> F64:
     down /= np.linalg.norm(down)
     centre = s.map_T_kf[:, :3, 3].mean(0)
     below = (s.points - centre) @ down
-    down, depth = _floor_plane(s.points - centre, below > 0.2, down)
+    down, depth = _floor_plane(s.points - centre, below > BELOW_M, down)
     across = np.cross(down, [1.0, 0, 0]) if abs(down[0]) < 0.9 else np.cross(down, [0, 0, 1.0])
     x = across / np.linalg.norm(across)
     axes = np.stack([x, np.cross(-down, x), -down], axis=1)
@@ -57,7 +59,7 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
         if normal @ down < math.cos(math.radians(10)):
             return down, level
         distance = (points[candidates] - mean) @ normal
-        near = points[candidates][np.abs(distance) < 0.05]
+        near = points[candidates][np.abs(distance) < THICK_M]
         if len(near) < 20:
             return down, level
     return normal, float(near.mean(0) @ normal)
@@ -65,7 +67,7 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
 
 def floor_level(depth: F64) -> float:
     """Metres to the lowest well-filled level. Args: depth, (N,) metres of points below the camera."""
-    counts, edges = np.histogram(depth, np.arange(depth.min(), depth.max() + 0.1, 0.05))
+    counts, edges = np.histogram(depth, np.arange(depth.min(), depth.max() + 2 * THICK_M, THICK_M))
     smooth = np.convolve(counts, [1, 2, 1], "same")
     full = np.flatnonzero(smooth > 0.4 * smooth.max())
-    return float(edges[full[-1]] + 0.025)
+    return float(edges[full[-1]] + THICK_M / 2)

@@ -13,7 +13,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.cameras import difference, unified
 from stereo_sfm.maps.joining import Joining
 from stereo_sfm.maps.saved_map import SavedMap

@@ -9,7 +9,7 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-# 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
+# Versions of files: 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
 SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE = 3, 4, 5
 VERSION = CAMERAS_SINCE
 KIND = "stereo_sfm_map"

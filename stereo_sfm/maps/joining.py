@@ -15,12 +15,11 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap, joined, restore_map
 from stereo_sfm.types import I64, LoopResult
 
 log = logging.getLogger("stereo_sfm")
-MERGE_PAUSE = 2  # keyframes between two loops of a merge: every link between the sessions helps
 
 
 class Joining:
@@ -81,7 +80,8 @@ class Joining:
     def closer(self, vocabulary: Vocabulary) -> LoopCloser:
         """A loop closer that looks for every link between sessions, by the widest rig, of equals the newest."""
         rigs = list(self.rigs.values())
-        return LoopCloser(dataclasses.replace(self._config, pause=MERGE_PAUSE), widest(rigs[::-1]), vocabulary)
+        eager = dataclasses.replace(self._config, pause=2)  # keyframes
+        return LoopCloser(eager, widest(rigs[::-1]), vocabulary)
 
 
 def join(

@@ -12,8 +12,6 @@ from stereo_sfm.mapping.rig_window import PRIOR
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.types import F64, Keyframe
 
-FIRST = 2  # keyframe with which the correction is applied: a map of one has no points that two keyframes see
-
 
 class KeptCorrection(SelfCalibration):
     """The first revision is the correction of the session before; later ones are estimated from there on."""
@@ -26,7 +24,7 @@ class KeptCorrection(SelfCalibration):
     def add(self, keyframe: Keyframe) -> Revision | None:
         """As the self-calibration's; what was tracked with the rig before the correction tells nothing."""
         self._keyframes_so_far += 1
-        if self._keyframes_so_far == FIRST:
+        if self._keyframes_so_far == 2:  # a map of one has no points that two keyframes see
             text = "as it ended in the session before of this camera"
             return Revision(self._kept.copy(), np.diag(PRIOR**2), 0, "kept", text)
         return self._in_all(super().add(keyframe)) if keyframe.rig_terms.any() else None

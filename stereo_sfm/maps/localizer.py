@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import within
 from stereo_sfm.mapping.level import mean_down
-from stereo_sfm.mapping.protocol import WithoutJobs
+from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.mapping.recalibration import calibration_update
 from stereo_sfm.mapping.self_calibration import SelfCalibration
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.types import F64, RIG_TERMS, CalibrationUpdate, Keyframe, LoopResult, MapUpdate
 
-LOST_AFTER = 5  # keyframes not found near the prediction before the whole map is searched
+LOST_AFTER = 5  # keyframes not found near the prediction, as beside people, before the whole map is searched
 
 
-class Localizer(WithoutJobs):
+class Localizer(AnyMapper):
     """For each keyframe, a `MapUpdate` that changes only `map_T_odom`, with the direction of gravity.
 
     The first location needs no prediction; if it has few inliers, a second keyframe must confirm it. Later keyframes
@@ -32,10 +29,10 @@ class Localizer(WithoutJobs):
 
     def __init__(self, relocalizer: Relocalizer, calibration: SelfCalibration | None = None) -> None:
         """Begin before the first keyframe. Args: calibration, estimates corrections of the rig; None: the rig stays."""
+        super().__init__(relocalizer.camera)
         self._relocalizer, self.saved = relocalizer, relocalizer.map
-        self.rig = self._source_rig = relocalizer.camera
         self._calibration = calibration
-        self._terms = self._tracked_terms = np.zeros(RIG_TERMS)  # of its correction: the newest, and the keyframes'
+        self._tracked_terms: F64 = np.zeros(RIG_TERMS)  # of the correction with which the keyframes were tracked
         self._saved_down = mean_down(self.saved.map_T_kf, self.saved.down, self.saved.down_sigma)
         self._map_T_odom: F64 = np.eye(4)
         self._version = 0
@@ -43,7 +40,6 @@ class Localizer(WithoutJobs):
         self._failures = 0
         self._unconfirmed: F64 | None = None  # map_T_odom by the newest keyframe, if it has few inliers
         self._waiting: list[tuple[int, F64]] | None = []  # keyframes of this submap without a location; None: located
-        self.found = False
         self.last: Location | None = None  # result of the newest keyframe
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
@@ -65,19 +61,10 @@ class Localizer(WithoutJobs):
             kf_id=keyframe.kf_id,
             kf_ids=np.array([kf_id for kf_id, _ in placed], np.int64),
             map_T_kf=np.array([self._map_T_odom @ odom_T_cam for _, odom_T_cam in placed]).reshape(-1, 4, 4),
-            point_ids=np.zeros(0, np.int64),
-            points_map=np.zeros((0, 3)),
-            culled_point_ids=np.zeros(0, np.int64),
-            fused_point_ids=np.zeros((0, 2), np.int64),
             map_T_odom=self._map_T_odom.copy(),
             calibration=revised,
             down=self._down(keyframe),
         )
-
-    @property
-    def calibration(self) -> tuple[Rig, F64]:
-        """The rig as the run began, and the terms (8,) of its correction so far."""
-        return self._source_rig, self._terms
 
     def _revise(self, keyframe: Keyframe) -> CalibrationUpdate | None:
         """Correct the rig where the keyframes show that it is wrong."""
@@ -92,21 +79,9 @@ class Localizer(WithoutJobs):
         where = self._version, keyframe.kf_id, keyframe.stamp_ns
         return calibration_update(revision, *where, self._calibration.applies)
 
-    def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
-        """No pending work."""
-        return None
-
-    def snapshot(self) -> None:
-        """No map is built."""
-        return
-
     def relocalize(self) -> None:
         """Do not trust the prediction: search the whole map with the next keyframe."""
         self._failures = LOST_AFTER
-
-    def place(self) -> None:
-        """No map is built that could be placed."""
-        return
 
     def _down(self, keyframe: Keyframe) -> F64:
         """(3,) direction of gravity in the map, zero where it is not known."""

@@ -12,14 +12,13 @@ import numpy as np
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.columns import COLUMNS
 from stereo_sfm.maps.joining import ends, join
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import I64, Bool, LoopResult
 
 _MAPPER = MapperConfig()
-MIN_SHARED_PIXELS = 0.5  # of the pixels at common times, in maps of one session; different images share hardly any
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,20 +64,20 @@ def share_a_session(a: SavedMap, b: SavedMap) -> bool:
     return any(_same_session(_sightings(a, m), _sightings(b, n)) for m in a.session_ids for n in b.session_ids)
 
 
-def _sightings(saved: SavedMap, session: int) -> dict[int, set[tuple[float, float]]]:
-    """The observed pixels of the left camera in a session (float32 as in files), by the keyframe's stamp."""
+def _sightings(saved: SavedMap, session: int) -> I64:
+    """(M, 2) of a session: the keyframe's stamp and the bits of a pixel of the left camera (float32 as in files)."""
     s = saved.snapshot
     rows = np.flatnonzero((saved.sessions == session)[s.obs_kf])
-    out: dict[int, set[tuple[float, float]]] = {}
-    for stamp, (u, v) in zip(s.stamp_ns[s.obs_kf[rows]].tolist(), s.uv_left[rows].astype(np.float32), strict=True):
-        out.setdefault(stamp, set()).add((float(u), float(v)))
-    return out
+    pixels = np.ascontiguousarray(s.uv_left[rows], np.float32).view(np.int64)
+    return np.unique(np.column_stack([s.stamp_ns[s.obs_kf[rows]], pixels]), axis=0)
 
 
-def _same_session(a: dict[int, set[tuple[float, float]]], b: dict[int, set[tuple[float, float]]]) -> bool:
-    times = a.keys() & b.keys()
-    same = sum(len(a[t] & b[t]) for t in times)
-    return same > MIN_SHARED_PIXELS * sum(min(len(a[t]), len(b[t])) for t in times)
+def _same_session(a: I64, b: I64) -> bool:
+    times = np.intersect1d(a[:, 0], b[:, 0])
+    a, b = (part[np.isin(part[:, 0], times)] for part in (a, b))
+    same = len(a) + len(b) - len(np.unique(np.concatenate([a, b]), axis=0))
+    counts = [np.unique(part[:, 0], return_counts=True)[1] for part in (a, b)]
+    return bool(2 * same > np.minimum(*counts).sum())  # different images share hardly any
 
 
 def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:

@@ -13,17 +13,17 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.maps.floor import floor_level
+from stereo_sfm.maps.floor import BELOW_M, THICK_M, floor_level
 from stereo_sfm.types import F64, Keyframe
 
-STEP_M, STEP_RAD = 0.5, 0.2  # between keyframes that are compared: long against errors of millimetres
+STEP_M, STEP_RAD = 0.5, 0.2  # metres, radians between keyframes that are compared: long against errors of millimetres
 MIN_STEPS, MOST_STEPS = 10, 1000  # from which their scatter is known; that are kept
 UPRIGHT_RAD = np.deg2rad(5.0)  # standard deviation of a roll about which nothing is known: cameras are mounted by eye
 LARGEST_RAD = np.deg2rad(60.0)  # beyond that the camera does not stand upright: up and down may be confused
 ENOUGH_RAD = np.deg2rad(0.2)  # standard deviation of the pitch: 3 mm of height in a metre
 LEAST = np.array([1e-3, np.deg2rad(0.02), 1e-3]) ** 2  # variances (m^2, rad^2, m^2) below which no odometry is
-FLOOR_RANGE_M, BELOW_M, NEAR_M = 5.0, 0.2, 0.05  # of points of the floor: distance, least depth, off its level
-POINTS = 200  # of a keyframe that are kept
+FLOOR_RANGE_M = 5.0  # to points of the floor: farther ones are too uncertain for its level
+POINTS = 200  # of a keyframe that are kept: 5 MB of a thousand keyframes
 ROUNDS = 10  # of weights and direction, which depend on each other
 
 
@@ -141,7 +141,7 @@ class MountingEstimate:
             return total, seen
         level = floor_level(below)
         for points, depth in zip(self._points, depths, strict=True):
-            chosen = points[np.abs(depth - level) < NEAR_M]
+            chosen = points[np.abs(depth - level) < THICK_M]
             if len(chosen) > 2:
                 offsets = chosen - chosen.mean(0)
                 total, seen = total + offsets.T @ offsets / len(chosen), seen + 1

@@ -15,7 +15,7 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
-from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.other_camera import widest
 from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
@@ -24,17 +24,17 @@ from stereo_sfm.loop.sideways import (
     TURNED,
     Fronts,
     front_of,
-    sideways_config,
+    of_a_part,
     with_neighbours,
 )
 from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
-SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
+SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: lamps and products repeat at larger steps
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
-MIN_RANGE_SIGMA_M = 0.003
+MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
 SIDE_PLACES = 12  # of `relocalize_candidates` that are verified beside: no confident one ends that search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
@@ -94,15 +94,9 @@ class Relocalizer:
         self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
-        self.config = dataclasses.replace(
-            config,
-            min_match_fraction=0.0,
-            min_inliers=config.relocalize_inliers // 3,  # competing places must be known
-            min_inlier_share=0.0,
-            min_cells=config.fewer_cells,
-        )
+        self.config = of_a_part(config, config.relocalize_inliers // 3)  # competing places must be known
         self._side_inliers = config.side_inliers
-        self._side_config = dataclasses.replace(sideways_config(config), min_inliers=self._side_inliers // 2)
+        self._side_config = of_a_part(config, self._side_inliers // 2)
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
@@ -309,13 +303,9 @@ class Relocalizer:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
         together = np.zeros(len(scores))
         together[self._described] = with_neighbours(scores[self._described])
-        chosen: list[int] = []
-        for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
-            if len(chosen) == self.config.relocalize_candidates or scores[row] <= 0:
-                break
-            if all(abs(row - other) > 2 for other in chosen):
-                chosen.append(row)
-        return chosen
+        best = np.argsort(-together, kind="stable")
+        scored = best[np.logical_and.accumulate(scores[best] > 0)]
+        return apart(scored.tolist(), 2, self.config.relocalize_candidates)
 
     def _nearest(self, guess: F64, count: int) -> I64:
         """Rows of the nearest keyframes, nearest first."""

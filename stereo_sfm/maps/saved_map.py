@@ -19,7 +19,8 @@ from stereo_sfm.calib.formats.native import read_native, rig_to_text, write_nati
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
-from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.cameras import MapCamera, cameras_text, difference, read_cameras, unified
 from stereo_sfm.maps.columns import COLUMNS, KEYS, check_columns
 from stereo_sfm.maps.header import (
@@ -266,15 +267,5 @@ def joined(maps: list[SavedMap]) -> SavedMap:
 
 def as_update(saved: SavedMap) -> MapUpdate:
     """A whole map as one message of the mapper."""
-    s, none = saved.snapshot, np.zeros(0, np.int64)
-    return MapUpdate(
-        version=1,
-        kf_id=int(s.kf_ids[-1]),
-        kf_ids=s.kf_ids.copy(),
-        map_T_kf=s.map_T_kf.copy(),
-        point_ids=s.pt_ids.copy(),
-        points_map=s.points.copy(),
-        culled_point_ids=none,
-        fused_point_ids=np.zeros((0, 2), np.int64),
-        map_T_odom=np.eye(4),
-    )
+    s = saved.snapshot
+    return MapUpdate(1, int(s.kf_ids[-1]), s.kf_ids.copy(), s.map_T_kf.copy(), s.pt_ids.copy(), s.points.copy())

@@ -9,18 +9,17 @@ from stereo_sfm.config import Config
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Keyframe, StereoImage
 
-SIDE_CORNERS = 2  # times as many as of a keyframe, which others in its place complete
-
 
 def still_keyframe(
     image: StereoImage, rig: Rig, max_features: int = 1000, config: Config | None = None
 ) -> Keyframe | None:
     """The keyframe of a tracker that starts at this image (pose identity); None with too few points."""
     config = config or Config()
+    sides = 2 * config.loop.side_corners  # a keyframe has fewer: others in its place complete it
     config = dataclasses.replace(
         config,
         tracker=dataclasses.replace(config.tracker, max_features=max_features),
-        loop=dataclasses.replace(config.loop, side_corners=SIDE_CORNERS * config.loop.side_corners),
+        loop=dataclasses.replace(config.loop, side_corners=sides),
     )
     tracker = make_tracker(config, rig)
     keyframe = tracker.step(image)[1]

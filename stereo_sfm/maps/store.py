@@ -28,7 +28,7 @@ from stereo_sfm.types import F64
 
 ABOUT, CHANGES = "store.yaml", "changes.txt"
 MOST_ABOUT = 1 << 20  # bytes: ten thousand labels
-KEPT_VERSIONS = 5
+KEPT_VERSIONS = 5  # earlier ones: a working week
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,9 +50,8 @@ def load_place(folder: Path) -> LoopResult | None:
         if not raw:
             return None
         data = read_arrays(raw)
-        ids = [int(data[name]) for name in ("kf_id", "candidate_kf_id", "inliers")]
-        relative, information, matches = (np.asarray(data[n]) for n in ("candidate_T_kf", "information", "matches"))
-        return LoopResult(ids[0], ids[1], relative, information, matches, ids[2], float(data["score"]), "")
+        fields: dict[str, Any] = {name: data[name] if data[name].ndim else data[name].item() for name in _FIELDS}
+        return LoopResult(**fields, reason="")
     except (OSError, KeyError, ValueError, TypeError):
         raise StereoSfmError(f"{folder} is damaged: its {PLACE} cannot be read") from None
 

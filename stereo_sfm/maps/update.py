@@ -17,16 +17,16 @@ from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.joining import join
 from stereo_sfm.maps.merge import share_a_session, subset
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, I64, Bool, LoopResult
 
-KEPT_SESSIONS = 3  # later sessions that saw a keyframe's view before it is forgotten
+KEPT_SESSIONS = 3  # later ones that saw a keyframe's view before it is forgotten: one may have seen a trolley there
 VIEW_DEPTHS = 0.25  # of the median depth of a keyframe: distance of a camera with the same view
 VIEW_METRES = 0.4, 1.5  # bounds of that distance
-VIEW_DEG = 25.0
+VIEW_DEG = 25.0  # degrees, of the same
 
 
 @dataclass(frozen=True, eq=False)

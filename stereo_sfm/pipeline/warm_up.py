@@ -149,7 +149,6 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
 
     Args: patient, images may wait for code: only that of the first one is loaded, the rest when it is called.
     """
-    from stereo_sfm.loop.database import PlaceDatabase
     from stereo_sfm.mapping.rig_window import SeenPoints, solve_window
     from stereo_sfm.mapping.self_calibration import SelfCalibration
 
@@ -176,4 +175,3 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
         if closer is not None:
             for keyframe in keyframes(rig):
                 closer.step(keyframe)
-            PlaceDatabase(1).keep(np.zeros(0, np.int64))  # as in a long run

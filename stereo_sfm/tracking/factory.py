@@ -1,15 +1,18 @@
-"""The tracker of a configuration: the default one by optical flow, or descriptors around a named estimator."""
+"""The tracker of a configuration: the default one by optical flow, or one of a plug-in."""
 
 from __future__ import annotations
 
+import importlib
+
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.protocol import AnyTracker, Places
+from stereo_sfm.tracking.protocol import AnyTracker, Places, TrackerPlugin
 from stereo_sfm.types import Trajectory
 
 __all__ = ["AnyTracker", "make_tracker"]
+
+PAPERS = "stereo_sfm.papers.trackers"  # a `TrackerPlugin`: the core knows its name only
 
 
 def make_tracker(
@@ -28,40 +31,19 @@ def make_tracker(
     Raises:
         StereoSfmError: an unknown method, or one that this camera cannot serve.
     """
-    tracker = _tracker(config, rig, spans, ground_truth, places)
-    if not config.manhattan.enabled:
-        return tracker
-    from stereo_sfm.tracking.manhattan_prior import ManhattanTracker
-
-    return ManhattanTracker(tracker, config.manhattan, rig)
-
-
-def _tracker(
-    config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Trajectory | None, places: Places | None
-) -> AnyTracker:
-    method = config.odometry.method
-    if method == "flow":
+    if config.odometry.method != "flow":
+        tracker = _papers().make_tracker(config, rig, spans, ground_truth)
+    else:
         from stereo_sfm.tracking.flow.place_corners import PlaceCorners
         from stereo_sfm.tracking.flow.side_views import SideViews
         from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
         from stereo_sfm.tracking.flow.tracker import Tracker
 
         corners, sides = PlaceCorners.wanted(config, rig), SideViews.wanted(config, rig)
-        return Tracker(config.tracker, rig, spans, corners, places, sides, SuddenTurns.wanted(config, rig))
-    from stereo_sfm.tracking.features.estimators import estimator
+        tracker = Tracker(config.tracker, rig, spans, corners, places, sides, SuddenTurns.wanted(config, rig))
+    return _papers().around(tracker, config, rig) if config.manhattan.enabled else tracker
 
-    if not rig.stereo and estimator(method).needs_depth:
-        raise StereoSfmError(
-            f"odometry {method} needs two cameras or depth, this source has one camera: use eight-point or pnp"
-        )
-    if not rig.stereo and method == "eight-point" and config.odometry.scale == "stereo":
-        raise StereoSfmError(
-            "one camera has no scale: choose --set odometry.scale=unit (steps of one metre) or ground-truth"
-        )
-    if method == "pnp" and (config.odometry.monocular or not rig.stereo):
-        from stereo_sfm.tracking.features.monocular import MonocularTracker
 
-        return MonocularTracker(config, rig, spans)
-    from stereo_sfm.tracking.features.feature_tracker import FeatureTracker
-
-    return FeatureTracker(config, rig, spans, ground_truth)
+def _papers() -> TrackerPlugin:
+    found: TrackerPlugin = importlib.import_module(PAPERS)  # pyright: ignore[reportAssignmentType]
+    return found

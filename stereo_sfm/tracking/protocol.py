@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage
+from stereo_sfm.config import Config
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, Trajectory
 
 
 class AnyTracker(Protocol):
@@ -20,6 +22,24 @@ class AnyTracker(Protocol):
     def describe(self, keyframe: Keyframe) -> Keyframe: ...
 
     def apply(self, update: MapUpdate) -> None: ...
+
+
+class TrackerPlugin(Protocol):
+    """A module with trackers besides the default one."""
+
+    def make_tracker(
+        self, config: Config, rig: Rig, spans: NoSpans | None = None, ground_truth: Trajectory | None = None
+    ) -> AnyTracker:
+        """The tracker that `config.odometry.method` names.
+
+        Raises:
+            StereoSfmError: an unknown method, or one that this camera cannot serve.
+        """
+        ...
+
+    def around(self, tracker: AnyTracker, config: Config, rig: Rig) -> AnyTracker:
+        """A tracker that asks another one, and adds what it knows itself."""
+        ...
 
 
 class Places(Protocol):

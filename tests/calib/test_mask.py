@@ -18,9 +18,9 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.papers.feature_view import ViewMaker
 from stereo_sfm.recording.describe import rig_lines
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.tracking.features.feature_view import ViewMaker
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.types import Bool, StereoImage
 

@@ -13,7 +13,8 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import window
-from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import I64, Keyframe
 
 

@@ -179,7 +179,7 @@ def test_compaction_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rows_of_keyframes_that_loops_name_no_more_are_freed_and_no_bit_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("stereo_sfm.mapping.map.FEW_KEYFRAMES", 4)
+    monkeypatch.setattr("stereo_sfm.mapping.columns.FEW", 4)
     stream = keyframe_stream(
         fisheye_rig(), to_and_fro(40, reach=4, step=0.05), points=200, track_length=8, per_keyframe=80
     )

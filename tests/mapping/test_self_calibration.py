@@ -14,7 +14,7 @@ from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.mapping.row_errors import RowMonitor
-from stereo_sfm.mapping.self_calibration import MIN_WINDOWS, TURNED_KEYFRAMES, Revision, SelfCalibration
+from stereo_sfm.mapping.self_calibration import KEYFRAMES, MIN_WINDOWS, Revision, SelfCalibration
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe
 from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around, turned
 
@@ -164,7 +164,7 @@ def noticed(
 @pytest.mark.parametrize("degrees", [(0.0, 0.1, 0.0), (0.0, -0.2, 0.0), (0.0, 0.0, 0.4)])
 def test_a_noticed_rotation_is_a_step_once_it_has_stayed(name: str, degrees: tuple[float, float, float]) -> None:
     true = RIGS[name]
-    rigs = [true] * 12 + [turned(true, degrees)] * TURNED_KEYFRAMES
+    rigs = [true] * 12 + [turned(true, degrees)] * KEYFRAMES
     estimator = SelfCalibration(true)
     *before, step = [estimator.add(k) for k in noticed(rigs, true, 0, 12, np.deg2rad(degrees))]
     assert not any(before) and step is not None and (step.why, step.since_kf_id) == ("step", 12)
@@ -175,7 +175,7 @@ def test_a_rotation_that_did_not_stay_is_none() -> None:
     true = RIGS["pinhole"]
     estimator = SelfCalibration(true)
     for k in noticed([true] * 40, true, 0, 12, np.deg2rad([0.0, 0.2, 0.0])):
-        back = k.kf_id >= 12 + TURNED_KEYFRAMES - 1
+        back = k.kf_id >= 12 + KEYFRAMES - 1
         assert estimator.add(replace(k, right_turn=np.zeros(3)) if back else k) is None
 
 

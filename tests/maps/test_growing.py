@@ -11,7 +11,7 @@ from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.growing import GrowingMap
 from stereo_sfm.maps.merge import subset
 from stereo_sfm.maps.saved_map import SavedMap

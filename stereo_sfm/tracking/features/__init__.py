@@ -1,1 +1,0 @@
-"""The trackers of the papers: descriptors matched from frame to frame around a named motion estimator."""
