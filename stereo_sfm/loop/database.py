@@ -1,6 +1,6 @@
 """Place database: an inverted index from words to keyframes, in arrays that grow by doubling.
 
-Postings of a word are a chain of blocks, so adding a keyframe never moves the others and a query reads only the
+Postings of a word are a linked list of blocks, so adding a keyframe never moves the others and a query reads only the
 postings of its words.
 """
 
@@ -20,7 +20,7 @@ BLOCK = 16  # postings; a word that few keyframes have takes one block
 
 
 class Postings(NamedTuple):
-    """The chains of blocks of all words."""
+    """The linked lists of blocks of all words."""
 
     head: I32  # (W,) newest block of each word, -1: none
     fill: I32  # (B,) postings in each block
@@ -31,7 +31,7 @@ class Postings(NamedTuple):
 
 @njit
 def _insert(words, weights, entry, to, used):
-    """Append (entry, weight) to the chain of each word; newest block first. Returns the number of used blocks."""
+    """Append (entry, weight) to the list of each word; newest block first. Returns the number of used blocks."""
     for i in range(words.shape[0]):
         w = words[i]
         block = to.head[w]
@@ -60,7 +60,7 @@ def _accumulate(words, weights, postings, scores):
 
 @njit
 def _copy_kept(postings, renamed, to):
-    """The postings of entries that have a new name (not -1), into empty chains. Returns the number of used blocks."""
+    """The postings of entries that have a new name (not -1), into empty lists. Returns the number of used blocks."""
     used = 0
     word, weight = np.empty(1, np.int32), np.empty(1, np.float32)
     for w in range(postings.head.shape[0]):

@@ -17,7 +17,7 @@ LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
 
 def find_floor(s: MapSnapshot) -> F64:
     """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
-    felt = s.down_sigma > 0  # gravity, where an IMU told it
+    felt = s.down_sigma > 0  # gravity, where an IMU measured it
     down = (s.map_T_kf[felt, :3, :3] @ s.down[felt, :, None])[..., 0].mean(0) if felt.any() else _upright(s)
     if np.linalg.norm(down) < 0.3:
         raise StereoSfmError(
