@@ -243,7 +243,7 @@ class KeyframeGraph:
 
 
 def _newest_between(a: I64, b: I64) -> Bool:
-    """(L,) which of loops between submaps (L,) and (L,), in order of time, are the newest between two different ones."""
+    """(L,) which loops between submaps (L,) and (L,), in order of time, are the newest between two different ones."""
     _, pair = np.unique(np.stack([np.minimum(a, b), np.maximum(a, b)], 1), axis=0, return_inverse=True)
     pair = pair.ravel()
     order = np.argsort(pair, kind="stable")
