@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm.cli import main
+from tests.test_docs import part_of_docs
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -62,9 +64,34 @@ def test_sentences_are_short(page: Path) -> None:
 
 
 def test_the_documentation_is_short() -> None:
-    words = [w for page in DOCS if page.name not in NOTEBOOK for w in page.read_text().split() if re.search(r"\w", w)]
-    assert len(words) <= MOST_WORDS  # the bars of tables are none
-    assert len((ROOT / "README.md").read_text().split()) <= 560
+    assert sum(words(page) for page in DOCS if page.name not in NOTEBOOK) <= MOST_WORDS
+    assert words(ROOT / "README.md") <= 500
+
+
+def words(page: Path) -> int:
+    """The bars of tables are none."""
+    return sum(re.search(r"\w", word) is not None for word in page.read_text().split())
+
+
+def test_the_readme_states_the_figures_of_the_benchmark() -> None:
+    """Our row: both parts, with their standard deviations."""
+    figures = json.loads((ROOT / "benchmarks" / "figures" / "spread.json").read_text())["figures"]
+    row = re.search(r"\| \*\*stereo-sfm\*\* \|.*", (ROOT / "README.md").read_text())
+    assert row is not None
+    for sequence in ("KITTI 00", "EuRoC MH01"):
+        se3, sim3 = (
+            next(f for f in figures if f["sequence"].startswith(sequence) and f["quantity"] == f"map, ATE {align}")
+            for align in ("SE(3)", "Sim(3)")
+        )
+        assert f"| {se3['value']} ± {se3['spread']} {se3['unit']} ({sim3['value']} {sim3['unit']}) |" in row[0]
+
+
+def test_the_site_shows_the_lines_of_the_next_version() -> None:
+    """Until a release moves them into the changelog."""
+    lines = [path.read_text().strip() for path in (ROOT / "changelog.d").glob("*.*.md")]
+    page = part_of_docs("hooks").text_of("changelog")
+    assert page.startswith("# Changelog\n") and all(f"\n- {line}\n" in page for line in lines)
+    assert not lines or page.index("## Next version") < page.index("## 0.1.0")
 
 
 def test_every_picture_is_made_by_the_script() -> None:
