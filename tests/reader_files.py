@@ -102,7 +102,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
     "runs/b": run_of("runs/b", "--seed", "1"),
     "runs/c": run_of("runs/c", "--seed", "2"),
     "store": map_of("store", "monday.mcap"),
-    "store2": map_of("store2", "tuesday.mcap"),
+    "store3": map_of("store3", "wednesday.mcap"),
     **dict.fromkeys(("mydata", "drive.mp4", "video:left.mkv?right=right.mkv", "drive/", "drive.bag"), images),
     "camchain.yaml": kalibr,
     "boards": boards,

@@ -8,6 +8,7 @@ import re
 import shlex
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -54,7 +55,7 @@ SLOW = ("tutorial.md", "tasks/batch.md", "tasks/dense.md", "tasks/saved-maps.md"
 # What a page calls its reader's files -> ours; X,Y are metres on a floor plan.
 OURS = {
     "SOURCE": "session.mcap", "SESSION...": "wednesday.mcap", "RUN": "runs/a", "DIR": "runs/a", "MAP": "store",
-    "STORE": "store", "A": "store", "B": "store2", "FORMAT": "tum", "OUT": "exported", "t265": "t265:simulated",
+    "STORE": "store", "A": "store", "B": "store3", "FORMAT": "tum", "OUT": "exported", "t265": "t265:simulated",
 }  # fmt: skip
 SHORTER = {
     "run": "--inline -q",
@@ -117,11 +118,14 @@ def call(line: str, shop: Path, few: bool) -> None:
     words = words_of(line)
     if few and words[0] == "run":
         words += ["--max-frames", str(FEW)]
+    written = {value for option, value in itertools.pairwise(words) if option in ("-o", "--correct", "--map-out")}
     for word in words:
-        file_of(shop, word)
-    for option, value in itertools.pairwise(words):
-        if option in ("-o", "--correct"):  # an example beside this one may have written it
-            shutil.rmtree(shop / value) if (shop / value).is_dir() else (shop / value).unlink(missing_ok=True)
+        if word not in written:
+            file_of(shop, word)
+        elif (shop / word).is_dir():  # an example beside this one wrote it
+            shutil.rmtree(shop / word)
+        else:
+            (shop / word).unlink(missing_ok=True)
     if words[0] == "serve":
         serve(words, shop)
     else:
@@ -130,7 +134,10 @@ def call(line: str, shop: Path, few: bool) -> None:
 
 def serve(words: list[str], shop: Path) -> None:
     """It prints the link of its page, and ends when it is asked to."""
-    command = [sys.executable, "-m", "stereo_sfm.cli", *words, "--set", "page.port=0"]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "stereo_sfm.cli", *words, "--set", f"page.port={port}"]
     with subprocess.Popen(command, cwd=shop, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as service:  # fmt: skip
         assert service.stdout is not None
