@@ -1,6 +1,6 @@
 PY ?= .venv/bin/python
 
-.PHONY: check prose test docs pictures bench
+.PHONY: check prose test docs pictures bench kernels
 check:  ## lint, format, types
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
@@ -14,6 +14,9 @@ test:  ## the fast tests
 
 docs:  ## the documentation as a site in build/site, its links checked
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+
+kernels:  ## compile the numerical kernels, which tests and runs load
+	$(PY) -m stereo_sfm.cli compile -q
 
 pictures:  ## the pictures of the documentation
 	$(PY) docs/pictures.py

@@ -301,9 +301,7 @@ RULES = (
         "weak = culling.weak_points(self.map, self.rig, rows, row, self._config)",
         "weak = rows[:0]",
     ),
-    _rule(
-        "triangulated anew", MAPPER, "self.map.move_points(recent, triangulate(self.map, self.rig, recent))", "pass"
-    ),
+    _rule("triangulated anew", MAPPER, "self.map.move_points(recent, triangulate(self.map, self.rig, recent))", "pass"),
     # Loops.
     _rule("rival loops", CLOSER, "if any(self._rivals(h, loop, support) for h in self._pending):", "if False:"),
     _rule(

@@ -140,7 +140,9 @@ class _Rates:
         at = (stamp_ns - stamp_ns[0]).astype(np.float64) * 1e-9
         inside = (at > times[0] + REACH_S) & (at < times[-1] - REACH_S) if len(times) else np.zeros(len(at), bool)
         if inside.sum() < MIN_FRAMES:
-            raise StereoSfmError(f"{int(inside.sum())} images with inertial samples around: {MIN_FRAMES} are needed")
+            raise StereoSfmError(
+                f"only {int(inside.sum())} images lie within IMU samples, {MIN_FRAMES} are needed: record longer"
+            )
         at, poses = at[inside], poses[inside]
         turns = se3.so3_log(np.swapaxes(poses[:-1, :3, :3], 1, 2) @ poses[1:, :3, :3])
         if np.sqrt(np.mean((turns / np.diff(at)[:, None]) ** 2)) < MIN_TURN / 3**0.5:

@@ -48,7 +48,7 @@ def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
             try:
                 image = eight_bits(decode_gray(path.read_bytes()))
             except (OSError, ValueError):
-                raise StereoSfmError(f"cannot read the image {path}") from None
+                raise StereoSfmError(f"cannot read the image {path}: remove it, or export it again") from None
             found = (image.shape[1], image.shape[0])
             size = found if size == (0, 0) else size
             if found != size:

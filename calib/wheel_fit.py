@@ -121,7 +121,7 @@ class _Drive:
         found = _Drive(wheel, at[inside], poses[inside] @ wheel.left_T_wheel, times, samples.part(good[order]))
         if found.way_m < MIN_WAY_M:
             short = f"{found.way_m:.2f} m of motion with wheel samples around it"
-            raise StereoSfmError(f"{short}: {MIN_WAY_M:g} m are needed")
+            raise StereoSfmError(f"{short}: {MIN_WAY_M:g} m are needed, drive farther")
         return found
 
     @property

@@ -94,7 +94,19 @@ def _examples() -> str:
     return "\n".join(parts)
 
 
+def _changelog() -> str:
+    """The changelog, with the lines of the next version above its first version."""
+    text = Path("CHANGELOG.md").read_text().replace("[changelog.d](changelog.d)", "`changelog.d`")
+    parts: list[str] = []
+    for kind in ("added", "changed", "fixed", "removed"):
+        lines = [path.read_text().strip() for path in sorted(Path("changelog.d").glob(f"*.{kind}.md"))]
+        parts += [f"### {kind.title()}\n", *(f"- {line}" for line in lines), ""] if lines else []
+    head, version, tail = text.partition("\n## ")
+    return head + ("\n## Next version\n\n" + "\n".join(parts) if parts else "") + version + tail
+
+
 MAKERS: dict[str, Callable[[], str]] = {
+    "changelog": _changelog,
     "commands": _commands,
     "configuration": _configuration,
     "sources": _sources,

@@ -2,31 +2,67 @@
 
     python docs/pictures.py [NAME ...]
 
-`viewer.png` needs a graphics adapter (rerun draws it without a window); `errors.png` is a plot of the report.
+rerun draws `viewer.png` without a window. It needs a graphics adapter, or Mesa's software one (Debian:
+mesa-vulkan-drivers). `errors.png` is a plot of the report.
 """
 
 from __future__ import annotations
 
+import itertools
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
+T = TypeVar("T")
 DOCS = Path(__file__).parent
 SIZE = "1600x950"
+MESSAGES_S = 15.0  # that the viewer shows its first messages
+ATTEMPTS = 60
 
 
 def viewer(run: Path, picture: Path) -> None:
-    """The viewer at the end of the run."""
-    rerun = Path(sys.executable).with_name("rerun")
-    made = run / "viewer.png"
-    command = [rerun, "--headless", run / "run.rrd", "--screenshot-to", made, "--window-size", SIZE]
-    subprocess.run(command, check=False, capture_output=True)
-    if not made.is_file():
-        raise SystemExit("viewer.png: rerun finds no graphics adapter here; the other pictures are written")
-    shutil.copy(made, picture)
+    """The viewer at the end of the run, once it has loaded and its first messages are gone."""
+    from PIL import Image
+    from rerun.experimental import ViewerClient
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    options = ["--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", port, "--window-size", SIZE]
+    command = [Path(sys.executable).with_name("rerun"), *options]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            url = f"rerun+http://127.0.0.1:{port}/proxy"
+            client = repeated(lambda: ViewerClient.connect(url), process)
+            repeated(lambda: client.open(str(run / "run.rrd")), process)
+            time.sleep(MESSAGES_S)
+            repeated(lambda: client.save_screenshot(str(run / "viewer.png")), process)
+        finally:
+            process.terminate()
+    with Image.open(run / "viewer.png") as shown:
+        shown.convert("RGB").quantize(256).save(picture, optimize=True)
+
+
+def repeated(action: Callable[[], T], process: subprocess.Popen[bytes]) -> T:
+    """An action of the viewer, again while it starts or draws slowly."""
+    for attempt in itertools.count(1):
+        try:
+            return action()
+        except Exception:
+            if process.poll() is not None:
+                raise SystemExit(
+                    "viewer.png: rerun finds no graphics adapter here (Debian: mesa-vulkan-drivers)"
+                ) from None
+            if attempt == ATTEMPTS:
+                raise
+            time.sleep(1.0)
+    raise AssertionError
 
 
 def errors(run: Path, picture: Path) -> None:
@@ -41,7 +77,7 @@ def main(names: list[str]) -> None:
     """Run once, then make the named pictures, or all."""
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        command = [sys.executable, "-m", "stereo_sfm.cli", "run", "--viz", "save", "-q", "-o", run]
+        command = [sys.executable, "-m", "stereo_sfm.cli", "run", "--viz", "save", "-q", "--inline", "-o", run]
         subprocess.run(command, check=True, cwd=DOCS.parent)
         for name in names or PICTURES:
             PICTURES[name](run, DOCS / name)

@@ -96,7 +96,7 @@ class FolderSource(BaseSource):
         imu: all inertial samples, ascending: each goes with the frame that ends its interval.
         """
         if not frames:
-            raise StereoSfmError(f"{name}: no images")
+            raise StereoSfmError(f"{name}: its list names no images")
         self.name = name
         self.rig = rig
         self.ground_truth = ground_truth
@@ -112,7 +112,7 @@ class FolderSource(BaseSource):
         dropped, read, unreadable, sampled = 0, 0, 0, 0
         if self.assumed_hz:
             log.warning(
-                "%s: neither names nor times.txt tell the stamps: %g images a second assumed (?fps=N)",
+                "%s: neither names nor times.txt give the stamps: %g images a second assumed (?fps=N)",
                 self.name, self.assumed_hz,
             )  # fmt: skip
         for frame_id, frame in enumerate(self.frames):
@@ -133,7 +133,9 @@ class FolderSource(BaseSource):
         if unreadable > SHOWN_WARNINGS:
             log.warning("%s: %d frames could not be read", self.name, unreadable)
         if not read:
-            raise StereoSfmError(f"{self.name}: none of the {len(self.frames)} images can be read")
+            raise StereoSfmError(
+                f"{self.name}: none of the {len(self.frames)} images can be read: copy or export them again"
+            )
 
     def _read(self, frame_id: int, frame: FrameFiles, dropped: int) -> StereoImage:
         left = eight_bits(read_gray(frame.left), self.bits)

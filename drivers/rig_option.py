@@ -37,7 +37,7 @@ def _chosen(option: RigOption, own: Callable[[], Rig]) -> Rig:
         except StereoSfmError as error:
             if "--rig" in str(error):
                 raise
-            raise StereoSfmError(f"{error}: mend it, or give a calibration with --rig FILE") from None
+            raise StereoSfmError(f"{error}: correct it, or give a calibration with --rig FILE") from None
     given, stated = (option, True) if isinstance(option, Rig) else _load(Path(option))
     bodiless = np.array_equal(given.body_T_left, np.eye(4))
     if not bodiless and stated:

@@ -479,7 +479,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(read_text(path, MAX_TEXT))
     except FileNotFoundError:
-        raise StereoSfmError(f"no configuration file at {path}") from None
+        raise StereoSfmError(f"no configuration file at {path} ('stereo-sfm config dump' prints one)") from None
     except OSError as error:
         raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -492,13 +492,13 @@ def parse_override(override: str) -> dict[str, Any]:
     """`key.subkey=value` as nested values."""
     key, equals, value = override.partition("=")
     if not equals:
-        raise StereoSfmError(f"--set takes key=value, got '{override}'")
+        raise StereoSfmError(f"--set takes key=value, as tracker.max_features=600, not '{override}'")
     for text in (value, repr(value)):
         try:
             return parse_toml(f"{key} = {text}")
         except ValueError:
             continue
-    raise StereoSfmError(f"--set cannot read '{override[:80]}'")
+    raise StereoSfmError(f"--set cannot read '{override[:80]}': write it as in tracker.max_features=600")
 
 
 def dump(config: Config) -> str:

@@ -35,6 +35,18 @@ def test_the_conda_recipe_has_our_dependencies() -> None:
     assert {"source", "build", "tests", "about"} <= set(recipe)
 
 
+@pytest.mark.parametrize("name", ["foxglove-schemas-protobuf", "mcap-protobuf-support"])
+def test_what_conda_forge_lacks_has_a_recipe(name: str) -> None:
+    """Of the version that we are tested with."""
+    recipe = yaml.safe_load((ROOT / "packaging" / "conda" / name / "recipe.yaml").read_text())
+    lock = (ROOT / "requirements.lock").read_text()
+    assert recipe["schema_version"] == 1 and recipe["package"]["name"] == name
+    assert f"\n{name}=={recipe['context']['version']}\n" in lock
+    assert re.fullmatch("[0-9a-f]{64}", recipe["source"]["sha256"]) and any(
+        one.startswith(name) for one in PROJECT["dependencies"]
+    )
+
+
 def test_the_ros_package_is_valid() -> None:
     package = ElementTree.parse(ROS2 / "package.xml").getroot()
     assert package.tag == "package" and package.get("format") == "3"

@@ -1,9 +1,9 @@
-"""Pages are short and plain; their command blocks run or say what they need; results come from their figures."""
+"""Pages are short and plain; results come from their figures."""
 
 from __future__ import annotations
 
+import json
 import re
-import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from stereo_sfm.cli import main
+from tests.test_docs import part_of_docs
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").rglob("*.md"))
@@ -19,29 +19,6 @@ READ = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *DO
 NOTEBOOK = ("notebook.md", "notebook-ablation.md")
 MOST_WORDS = 12_700  # of docs/ without the lab notebook
 LONGEST = 25  # words of a sentence
-# What a block of commands needs besides this package and the bundled recording; the others are run below.
-NEEDS = {
-    "tutorial.md": "an environment of its own",
-    "drivers.md": "two webcams; tests/drivers/test_plugin.py runs it on videos",
-    "tasks/record.md": "a camera",
-    "tasks/service.md": "root, systemd, podman; tests/service run the service",
-    "tasks/service-outputs.md": "a running service, ROS; tests/service run both",
-    "tasks/saved-maps.md": "recordings of several days; tests/maps run them",
-    "tasks/calibrate.md": "a target and a recording of it; tests/calib run it",
-    "tasks/self-calibration.md": "a recording; tests/commands run it",
-    "tasks/masks.md": "a recording of a robot; tests/calib run it",
-    "tasks/own-data.md": "images of the reader; tests/drivers and tests/commands run each kind",
-    "tasks/batch.md": "recordings, Ray; tests/eval/test_batch.py runs it",
-    "tasks/debug.md": "a recording that was lost",
-    "tasks/evaluate.md": "runs; tests/eval run each",
-    "tasks/dense.md": "a run with images; tests/dense run it",
-    "ablation.md": "hours; tests/eval/test_ablation.py runs a cell",
-    "concepts/inertial.md": "nothing: settings",
-    "concepts/frames.md": "nothing: a drawing",
-    "concepts/pipeline.md": "nothing: a drawing",
-    "reference/configuration.md": "",
-    "tasks/simulate.md": "",
-}
 
 
 def sentences(page: str) -> Iterator[str]:
@@ -62,9 +39,34 @@ def test_sentences_are_short(page: Path) -> None:
 
 
 def test_the_documentation_is_short() -> None:
-    words = [w for page in DOCS if page.name not in NOTEBOOK for w in page.read_text().split() if re.search(r"\w", w)]
-    assert len(words) <= MOST_WORDS  # the bars of tables are none
-    assert len((ROOT / "README.md").read_text().split()) <= 560
+    assert sum(words(page) for page in DOCS if page.name not in NOTEBOOK) <= MOST_WORDS
+    assert words(ROOT / "README.md") <= 500
+
+
+def words(page: Path) -> int:
+    """The bars of tables are none."""
+    return sum(re.search(r"\w", word) is not None for word in page.read_text().split())
+
+
+def test_the_readme_states_the_figures_of_the_benchmark() -> None:
+    """Our row: both parts, with their standard deviations."""
+    figures = json.loads((ROOT / "benchmarks" / "figures" / "spread.json").read_text())["figures"]
+    row = re.search(r"\| \*\*stereo-sfm\*\* \|.*", (ROOT / "README.md").read_text())
+    assert row is not None
+    for sequence in ("KITTI 00", "EuRoC MH01"):
+        se3, sim3 = (
+            next(f for f in figures if f["sequence"].startswith(sequence) and f["quantity"] == f"map, ATE {align}")
+            for align in ("SE(3)", "Sim(3)")
+        )
+        assert f"| {se3['value']} ± {se3['spread']} {se3['unit']} ({sim3['value']} {sim3['unit']}) |" in row[0]
+
+
+def test_the_site_shows_the_lines_of_the_next_version() -> None:
+    """Until a release moves them into the changelog."""
+    lines = [path.read_text().strip() for path in (ROOT / "changelog.d").glob("*.*.md")]
+    page = part_of_docs("hooks").text_of("changelog")
+    assert page.startswith("# Changelog\n") and all(f"\n- {line}\n" in page for line in lines)
+    assert not lines or page.index("## Next version") < page.index("## 0.1.0")
 
 
 def test_every_picture_is_made_by_the_script() -> None:
@@ -72,40 +74,6 @@ def test_every_picture_is_made_by_the_script() -> None:
     shown = {name for page in READ for name in re.findall(r"!\[[^]]*\]\((?:\.\./|docs/)?([\w.]+)\)", page.read_text())}
     assert shown and all(f'"{name}": ' in text for name in shown), shown
     assert shown == {path.name for path in (ROOT / "docs").glob("*.png")}
-
-
-def blocks(page: Path) -> list[list[str]]:
-    """Indented blocks of a page that contain a command."""
-    found = re.findall(r"(?:^    .*\n)+", re.sub(r"```.*?```", "", page.read_text(), flags=re.S), re.M)
-    made = [[line.strip() for line in block.splitlines()] for block in found]
-    return [block for block in made if any(line.startswith("stereo-sfm ") for line in block)]
-
-
-def test_every_page_with_commands_is_run_or_says_what_it_needs() -> None:
-    pages = {page.relative_to(ROOT / "docs").as_posix() for page in DOCS if blocks(page)}
-    assert pages <= set(NEEDS), f"run these blocks below, or say in NEEDS what they need: {pages - set(NEEDS)}"
-
-
-@pytest.mark.parametrize("name", [name for name, need in NEEDS.items() if not need])
-def test_blocks_without_needs_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    for block in blocks(ROOT / "docs" / name):
-        for line in block:
-            words = shlex.split(line)[1:]
-            short = ["--max-frames", "5", "--inline", "-q"] if words[0] == "run" else []
-            assert main([*words, *short]) in (0, 4)  # five frames need not make a map
-
-
-@pytest.mark.slow
-def test_the_tutorial_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All its commands after the installation, in order, in one folder; the session is shorter."""
-    monkeypatch.chdir(tmp_path)
-    lines = [line for block in blocks(ROOT / "docs" / "tutorial.md") for line in block]
-    commands = [shlex.split(line)[1:] for line in lines if line.startswith("stereo-sfm ")]
-    assert [words[0] for words in commands] == ["record", "info", "check-calib", "run", "replay", "record", "run"]
-    for words in commands:
-        words = [re.sub(r"seed=3$", "seed=3&frames=150", word) for word in words]
-        assert main(words) in ((0, 3) if words[0] == "check-calib" else (0,)), words
 
 
 def test_the_page_of_results_is_made_from_its_figures() -> None:

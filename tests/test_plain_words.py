@@ -16,8 +16,6 @@ ROOT = Path(__file__).parents[1]
 TERMS: dict[str, str] = tomllib.loads((ROOT / "docs" / "private_terms.toml").read_text())["terms"]
 PRIVATE = re.compile(rf"(?<![\w./_-])(?:{'|'.join(TERMS)})(?![\w./_(]\w|[_(-])", re.IGNORECASE)
 CODE = ("stereo_sfm", "drivers", "calib", "benchmarks", "examples", "recordings")
-# Rooms whose comments are read by developers only; their texts for users are checked as everywhere.
-CORE = tuple(f"stereo_sfm/{room}/" for room in ("tracking", "mapping", "loop", "maps"))
 QUOTES = "benchmarks/_ablate_rules.py"  # lines of the core's source, to replace them
 LINKS = (("stereo_sfm", "drivers"), ("stereo_sfm", "calib"))
 PAGES = ("*.md", "docs/**/*.md", "changelog.d/*.md", "packaging/**/*.md", "stereo_sfm/**/static/*.html")
@@ -31,18 +29,14 @@ def programs() -> Iterator[Path]:
                 yield path
 
 
-def texts(program: str, comments: bool) -> Iterator[tuple[int, str]]:
-    """Line and text of every string of more than one word; docstrings and comments where they are asked for."""
-    tree = ast.parse(program)
-    loose = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
-        shown = isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value.strip()
-        if shown and (comments or id(node) not in loose):
+def texts(program: str) -> Iterator[tuple[int, str]]:
+    """Line and text of every string of more than one word, docstrings included, and of every comment."""
+    for node in ast.walk(ast.parse(program)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and " " in node.value.strip():
             yield node.lineno, node.value
-    if comments:
-        for token in tokenize.generate_tokens(io.StringIO(program).readline):
-            if token.type == tokenize.COMMENT:
-                yield token.start[0], token.string
+    for token in tokenize.generate_tokens(io.StringIO(program).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
 
 
 def found_in(lines: Iterator[tuple[int, str]]) -> list[str]:
@@ -53,7 +47,7 @@ def test_programs_use_the_fields_words() -> None:
     found: list[str] = []
     for path in programs():
         name = path.relative_to(ROOT).as_posix()
-        found += [f"{name} {one}" for one in found_in(texts(path.read_text(), not name.startswith(CORE)))]
+        found += [f"{name} {one}" for one in found_in(texts(path.read_text()))]
     assert not found, "\n".join(["say it in the words of docs/private_terms.toml:", *found])
 
 
@@ -68,8 +62,7 @@ def test_pages_use_the_fields_words(pattern: str) -> None:
 
 
 def test_a_private_word_is_found() -> None:
-    """In a message, not in a name."""
+    """In a message or a comment, not in a name."""
     program = '"""A knock of the rig."""\nlog.info("a knock at %s", 1)\nx = {"knock": knock.wanted()}  # one eye\n'
-    assert found_in(texts(program, comments=True)) == ["line 1: 'knock'", "line 2: 'knock'", "line 3: 'eye'"]
-    assert found_in(texts(program, comments=False)) == ["line 2: 'knock'"]
+    assert found_in(texts(program)) == ["line 1: 'knock'", "line 2: 'knock'", "line 3: 'eye'"]
     assert not found_in(iter([(1, "the fisheye of /calibration/knock, camchain.yaml, tracker.knock")]))

@@ -75,11 +75,15 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
     name = format or {".json": "foxglove", ".xml": "opencv"}.get(path.suffix, "rig")
     write = _function(name, 2)
     if rig.readout_s and name != "rig":
-        log.warning("%s cannot store the readout time of a rolling shutter (%g s): it is lost", name, rig.readout_s)
+        log.warning(
+            "%s cannot store the readout time of a rolling shutter (%g s), it is lost: the format 'rig' keeps it",
+            name,
+            rig.readout_s,
+        )
     if rig.imu is not None and name not in WITH_IMU:
-        log.warning("%s cannot store an IMU: its calibration is lost", name)
+        log.warning("%s cannot store an IMU, its calibration is lost: the format 'rig' keeps it", name)
     if rig.wheel is not None and name != "rig":
-        log.warning("%s cannot store wheel odometry: its calibration is lost", name)
+        log.warning("%s cannot store wheel odometry, its calibration is lost: the format 'rig' keeps it", name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(rig, path)

@@ -74,7 +74,7 @@ def imu_T_left(rig: Rig, format: str) -> F64:
         return rig.body_T_left
     found = se3.inverse(rig.imu.left_T_imu)
     if not (np.allclose(rig.body_T_left, found, atol=1e-9) or np.array_equal(rig.body_T_left, np.eye(4))):
-        log.warning("the body is the IMU in %s: body_T_left of the rig is lost", format)
+        log.warning("the body is the IMU in %s, body_T_left of the rig is lost: the format 'rig' keeps it", format)
     return found
 
 
@@ -89,7 +89,9 @@ def warn_of_lost(imu: Imu, format: str, offset: bool = False, affine: bool = Fal
     if imu.offset_s and not offset:
         lost.append("time offset")
     if lost:
-        log.warning("%s cannot store %s of an IMU: lost", format, " and ".join(lost))
+        log.warning(
+            "%s cannot store %s of an IMU, which are lost: the format 'rig' keeps them", format, " and ".join(lost)
+        )
 
 
 def _noise(imu: Imu) -> dict[str, float]:

@@ -51,7 +51,7 @@ def _mav_folder(folder: Path) -> Path:
     for mav in (folder / "mav0", folder):
         if (mav / "cam0").is_dir():
             return mav
-    raise StereoSfmError(f"{folder} has no mav0/cam0 folder")
+    raise StereoSfmError(f"{folder} has no mav0/cam0 folder: name the folder that holds mav0")
 
 
 def _open(name: str, mav: Path, rig: Rig) -> FolderSource:

@@ -89,4 +89,4 @@ def _check_speed(device: UsbDevice, access: Access) -> None:
             f"the T265 on {place(device)} is on a USB 2 link ({SPEEDS[speed]} speed), which cannot carry 41 MB/s of "
             "images: use a USB 3 port and cable, or allow losses with the option allow_slow=1"
         )
-    logger.warning("T265 on a USB 2 link: expect lost frames")
+    logger.warning("T265 on a USB 2 link, frames will be lost: use a USB 3 port and cable")

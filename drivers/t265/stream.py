@@ -165,4 +165,8 @@ class Stream:
             if probe.index == 0:
                 self._counters["temperature_c"] = probe.celsius
                 if probe.threshold > 0 and probe.celsius > probe.threshold:
-                    logger.warning("T265 is hot: %.0f of %.0f degrees Celsius", probe.celsius, probe.threshold)
+                    logger.warning(
+                        "T265 is hot, %.0f of %.0f degrees Celsius, and may stop: let air reach it",
+                        probe.celsius,
+                        probe.threshold,
+                    )

@@ -133,7 +133,7 @@ def _match_images(every: int | None) -> MatchImages | None:
     if every is None:
         return None
     if every < 1:
-        raise StereoSfmError("--matches must be at least 1")
+        raise StereoSfmError(f"--matches must be at least 1, not {every}")
     from stereo_sfm.viz.match_images import MatchImages
 
     return MatchImages(every)

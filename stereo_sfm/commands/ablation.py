@@ -146,7 +146,9 @@ def _check_sources(cells: Sequence[Cell]) -> None:
     for spec in dict.fromkeys(cell.source for cell in cells):
         with open_source(spec) as source:
             if source.ground_truth is None:
-                raise StereoSfmError(f"{source.name} has no ground truth to evaluate the cells against")
+                raise StereoSfmError(
+                    f"{source.name} has no ground truth to compare with: choose a source that has, as sim:loop"
+                )
 
 
 def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what: str) -> Sequence[str]:

@@ -69,7 +69,9 @@ def _results(tasks: Sequence[BatchTask], address: str | None) -> Iterator[tuple[
     except (ConnectionError, ValueError) as error:
         if address is None:
             raise
-        raise StereoSfmError(f"no Ray cluster at {address}: {str(error).splitlines()[0]}") from None
+        raise StereoSfmError(
+            f"no Ray cluster at {address} (leave out --address to use this machine): {str(error).splitlines()[0]}"
+        ) from None
 
 
 def _expand(patterns: list[str]) -> list[str]:
@@ -78,6 +80,6 @@ def _expand(patterns: list[str]) -> list[str]:
     for pattern in patterns:
         found = sorted(glob.glob(pattern))
         if not found and any(c in pattern for c in "*[") and not pattern.startswith("sim:"):
-            raise StereoSfmError(f"no recording matches {pattern}")
+            raise StereoSfmError(f"no recording matches {pattern}: check the folder and the pattern")
         out += [str(Path(f).resolve()) for f in found] or [pattern]
     return out

@@ -135,7 +135,9 @@ def run_sensors(options: CalibrateOptions) -> int:
     findings = []
     for wanted, samples, name in ((options.imu, motion.imu, "inertial"), (options.wheel, motion.wheel, "wheel")):
         if wanted and not samples:
-            raise StereoSfmError(f"{options.source} has no {name} samples")
+            raise StereoSfmError(
+                f"{options.source} has no {name} samples: record them with the images, or name another source"
+            )
     if options.imu:
         imu = motion.fit_imu()
         rig, findings = replace(rig, imu=imu.imu), precision_imu(imu)
@@ -159,7 +161,7 @@ def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
     for path in (rig, report):
         _check_writable(path, overwrite)
     if report.is_dir():
-        raise StereoSfmError(f"cannot write the report {report}: it is a folder")
+        raise StereoSfmError(f"cannot write the report {report}: it is a folder, name a file")
 
 
 def _check_writable(path: Path, overwrite: bool) -> None:

@@ -61,7 +61,7 @@ def load_runs(folders: Sequence[Path], ref: str | None = None) -> list[ComparedR
 
     names = compare.names_of(folders)
     if len(set(names)) < len(names):
-        raise StereoSfmError("the same run is named twice")
+        raise StereoSfmError(f"a run is named twice, name each once: {' '.join(map(str, folders))}")
     found: list[ComparedRun] = []
     for name, folder in zip(names, folders, strict=True):
         stats = compare.stats_of(folder)

@@ -174,7 +174,7 @@ def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None
         return read_trajectory(path), path
     with SourceChoice(spec, opening.rig, rectify=opening.rectify)() as opened:
         if opened.ground_truth is None:
-            raise StereoSfmError(f"{opened.name} has no ground truth")
+            raise StereoSfmError(f"{opened.name} has no ground truth: name a trajectory file or another source")
         return opened.ground_truth, None
 
 

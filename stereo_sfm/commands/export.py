@@ -171,7 +171,7 @@ def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:
             raise StereoSfmError("--session goes with maps: a run is one session")
         return {0: read_trajectory(options.source / name)}, named_pose(options.source / name)
     if not (options.source / "map.json").is_file():
-        raise StereoSfmError(f"{options.source} holds no {name}")
+        raise StereoSfmError(f"{options.source} holds no {name}: name the folder of a run or of a map")
     if options.which == "odom":
         raise StereoSfmError(f"{options.source} is a map: it holds keyframes, not the odometry of a run")
     saved = _load(options.source)

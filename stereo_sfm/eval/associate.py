@@ -54,7 +54,7 @@ def associate(
         StereoSfmError: the two have no time in common.
     """
     if not len(estimate) or not len(reference):
-        raise StereoSfmError("a trajectory without poses cannot be compared")
+        raise StereoSfmError("a trajectory without poses cannot be compared: was tracking lost from the start?")
     if interpolate:
         poses, kept = poses_at(reference, estimate.stamp_ns)
     else:

@@ -80,7 +80,7 @@ def compare(runs: Sequence[ComparedRun], folder: Path) -> Path:
     against = "ground truth" if reference is not None else f"the run {runs[0].name}: no run has ground truth"
     lines = [
         f"# {len(runs)} runs", "", f"Errors are after SE(3) alignment with {against}.", "",
-        "| " + " | ".join(COLUMNS) + " |", "|---" * len(COLUMNS) + "|",
+        "| " + " | ".join(map(_title, COLUMNS)) + " |", "|---" * len(COLUMNS) + "|",
         *("| " + " | ".join(map(_text, COLUMNS, row)) + " |" for row in rows), "",
         "## Trajectories", "", "![trajectory](trajectory.png)", "",
         *(["## Errors", "", "![errors](errors.png)", ""] if evaluations else []),
@@ -99,7 +99,9 @@ def differences(runs: Sequence[ComparedRun]) -> list[list[str]]:
     reference = next((run.reference for run in runs if run.reference is not None), None)
     evaluations = _evaluations(runs, reference)
     columns = zip(*(_row(run, evaluations.get(run.name)) for run in runs), strict=True)
-    rows = [[name, *(_text(name, value) for value in values)] for name, values in zip(COLUMNS, columns, strict=True)]
+    rows = [
+        [_title(name), *(_text(name, value) for value in values)] for name, values in zip(COLUMNS, columns, strict=True)
+    ]
     more: dict[str, Callable[[dict[str, Any]], str]] = {
         "lost intervals": lambda stats: str(len(stats["lost_intervals"])),
         "dropped": lambda stats: str(stats["dropped"]),
@@ -160,6 +162,11 @@ def _row(run: ComparedRun, result: Evaluation | None) -> list[Any]:
         None if result is None else result.sim3_scale, stats["frames_per_s"],
         *(ms[stage]["p50"] if stage in ms else None for stage in ("track", "map")), stats["fingerprint"],
     ]  # fmt: skip
+
+
+def _title(name: str) -> str:
+    """Of a column for people: an error names its own unit."""
+    return name.removesuffix(" m") if name.startswith("ATE") else name
 
 
 def _text(column: str, value: Any) -> str:

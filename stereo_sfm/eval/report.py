@@ -66,10 +66,10 @@ def write_report(
     drawings = _plots_by_name(folder, record, stats, estimates, evaluations)
     judged = verdicts(stats, evaluations)
     warnings = sum(line.startswith("**WARN**") for line in judged)
-    lines = [f"# {source_name}", "", headline(stats, evaluations, warnings), ""]
+    lines = [f"# {Path(source_name).name}", "", headline(stats, evaluations, warnings), ""]
     lines += ["![trajectory](trajectory.png)", ""] if "trajectory" in drawings else []
     lines += ["## Verdict", "", *(f"* {verdict}" for verdict in judged), ""]
-    lines += ["## Summary", "", *(f"* {line}" for line in summary(stats, evaluations))]
+    lines += ["## Summary", "", f"* source: {source_name}", *(f"* {line}" for line in summary(stats, evaluations))]
     lines += _warnings(stats)
     for name, result in evaluations.items():
         lines += ["", f"## {name.capitalize()} against ground truth", "", "| | |", "|---|---|"]

@@ -47,7 +47,7 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05, map_T_floor: F64 |
     if not (math.isfinite(resolution) and resolution > 0):
         raise StereoSfmError(f"the resolution of a floor plan must be above 0 metres, not {resolution}")
     if len(s.points) < 50:
-        raise StereoSfmError("the map holds too few points for a floor plan")
+        raise StereoSfmError("the map holds too few points for a floor plan: map a longer path")
     map_T_floor = find_floor(s) if map_T_floor is None else map_T_floor
     points = se3.transform(se3.inverse(map_T_floor), s.points)
     cameras = se3.transform(se3.inverse(map_T_floor), s.map_T_kf[:, :3, 3])
@@ -60,7 +60,8 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05, map_T_floor: F64 |
     cells = np.ceil((corners.max(0) + MARGIN - low) / resolution)
     if not cells.prod() <= MAX_CELLS:
         raise StereoSfmError(
-            f"a floor plan with {resolution:g} m per pixel would have {cells[0]:.3g} x {cells[1]:.3g} pixels"
+            f"a floor plan with {resolution:g} m per pixel would have {cells[0]:.3g} x {cells[1]:.3g} pixels: "
+            "choose more metres a pixel"
         )
     size = cells.astype(int)
     passed = np.zeros((size[1], size[0]), np.int32)
@@ -134,7 +135,7 @@ def write_floor_plan(plan: FloorPlan, path: Path) -> None:
 
     image, about = plan_files(path)
     if not cv2.imwrite(str(image), plan.image):
-        raise StereoSfmError(f"cannot write {image}")
+        raise StereoSfmError(f"cannot write {image}: may you write there, and is the disk full?")
     about.write_text(description(plan, image.name), encoding="utf-8")
 
 

@@ -59,6 +59,6 @@ def write_zones(folder: Path, plan: FloorPlan, zones: Bool) -> None:
     mask: U8 = np.where(zones, OCCUPIED, FREE).astype(np.uint8)
     for name, image in ((DRAWING, picture), (f"{MASK}.pgm", mask)):
         if not cv2.imwrite(str(folder / name), image):
-            raise StereoSfmError(f"cannot write {folder / name}")
+            raise StereoSfmError(f"cannot write {folder / name}: may you write there, and is the disk full?")
     (folder / ABOUT).write_text(description(plan, DRAWING), encoding="utf-8")
     (folder / f"{MASK}.yaml").write_text(description(plan, f"{MASK}.pgm"), encoding="utf-8")

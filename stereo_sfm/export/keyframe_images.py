@@ -104,4 +104,4 @@ def _write(path: Path, pixels: U8) -> None:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if not cv2.imwrite(str(path), pixels):
-        raise StereoSfmError(f"cannot write {path}")
+        raise StereoSfmError(f"cannot write {path}: may you write there, and is the disk full?")

@@ -70,4 +70,6 @@ def _config(raw: bytes, reader: LogReader) -> Config:
     try:
         return from_dict(settings)
     except StereoSfmError as error:
-        raise StereoSfmError(f"{reader.path} was written by another version of this program: {error}") from None
+        raise StereoSfmError(
+            f"{reader.path} was written by another version of stereo-sfm, use that one: {error}"
+        ) from None

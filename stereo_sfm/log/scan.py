@@ -51,7 +51,7 @@ def check_magic(stream: IO[bytes], path: Path) -> None:
     stream.seek(0)
     start = stream.read(len(MCAP0_MAGIC))
     if not start:
-        raise StereoSfmError(f"{path} is empty")
+        raise StereoSfmError(f"{path} is empty: nothing was recorded")
     if start != MCAP0_MAGIC:
         raise StereoSfmError(f"{path} is not an MCAP file")
 

@@ -250,6 +250,8 @@ def decoder(cls: type[Any], schema: bytes) -> Callable[[bytes], Any]:
         except (DecodeError, ValueError, LookupError, OverflowError):
             raise ValueError(f"a damaged {cls.__name__} message") from None
         except TypeError as error:
-            raise StereoSfmError(f"{cls.__name__} in this log was written by another version: {error}") from None
+            raise StereoSfmError(
+                f"{cls.__name__} in this log was written by another version of stereo-sfm, use that one: {error}"
+            ) from None
 
     return decode

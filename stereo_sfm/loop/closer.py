@@ -51,7 +51,7 @@ PLACE_RADIUS = (
 )
 KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
-TWIN = 0.85  # the same of the share of corners of its best keyframe, where several found it
+TWIN = 0.85  # the corresponding limit of the share of corners of its best keyframe, where several found it
 LOOKALIKES = 3000  # hypotheses between sessions that are remembered: it bounds memory
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals

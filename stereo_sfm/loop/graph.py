@@ -23,7 +23,7 @@ MIN_SPEED = 0.5  # metres a second, lower bound of that speed
 SPEED_NS = 1_000_000_000  # before a gap, over which it is measured: what covers a camera disturbs its last few poses
 KNOWN_PATHS = 4096  # that are remembered, a few megabytes
 FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
-NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two chains half
+NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two submaps half
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there: a second has fewer
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
@@ -51,10 +51,10 @@ class _Nodes(Columns):
 
     kf_id: I64 = column(np.int64, -1)  # ascending
     stamp_ns: I64 = column(np.int64, 0)
-    chain: I64 = column(np.int64, 0)  # number of the uninterrupted part of the odometry
+    submap: I64 = column(np.int64, 0)  # number of the uninterrupted part of the odometry
     odom_T_cam: F64 = column(np.float64, np.eye(4), (4, 4))  # (K, 4, 4)
     anchored: F64 = column(np.float64, np.eye(4), (4, 4))  # corrected at each loop to the pose of its older end
-    frame: I64 = column(np.int64, 0)  # the chain whose frame `anchored` is in
+    frame: I64 = column(np.int64, 0)  # the submap whose frame `anchored` is in
     distance: F64 = column(np.float64, 0.0)  # metres since the start
     kept: Bool = column(np.bool_, True)  # False: no longer a candidate
 
@@ -71,24 +71,24 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self._nodes, self._loops = _Nodes(), _Loops()
-        self._joined: dict[int, int] = {}  # chain -> number of the group of chains that loops connect
+        self._joined: dict[int, int] = {}  # submap -> number of the group of submaps that loops connect
         self._forget_at = FIRST_FORGOTTEN
         self._known: dict[tuple[int, int], GraphPath | None] = {}  # paths since the last loop, by ids of their ends
 
     def _row(self, kf_id: int) -> int:
         return int(np.searchsorted(self._nodes.kf_id, kf_id))
 
-    def add(self, kf_id: int, odom_T_cam: F64, chain: int, stamp_ns: int = 0) -> None:
-        """Append the newest keyframe; `chain` numbers the uninterrupted part of the odometry it belongs to."""
-        anchored, frame, distance = odom_T_cam, chain, 0.0
+    def add(self, kf_id: int, odom_T_cam: F64, submap: int, stamp_ns: int = 0) -> None:
+        """Append the newest keyframe; `submap` numbers the uninterrupted part of the odometry it belongs to."""
+        anchored, frame, distance = odom_T_cam, submap, 0.0
         if len(self._nodes):
             last = self._nodes.odom_T_cam[-1]
             distance = float(self._nodes.distance[-1] + np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
-            if self._nodes.chain[-1] == chain:
+            if self._nodes.submap[-1] == submap:
                 anchored, frame = self._nodes.anchored[-1] @ se3.inverse(last) @ odom_T_cam, self._nodes.frame[-1]
-        self._joined.setdefault(chain, chain)
+        self._joined.setdefault(submap, submap)
         self._nodes.append(
-            1, kf_id=kf_id, stamp_ns=stamp_ns, chain=chain, odom_T_cam=odom_T_cam, anchored=anchored, frame=frame,
+            1, kf_id=kf_id, stamp_ns=stamp_ns, submap=submap, odom_T_cam=odom_T_cam, anchored=anchored, frame=frame,
             distance=distance,
         )  # fmt: skip
 
@@ -110,11 +110,11 @@ class KeyframeGraph:
         if count < self._forget_at:
             return None
         a, b = loops.ends.T
-        needed = (nodes.kept[a] & nodes.kept[b]) | _newest_between(nodes.chain[a], nodes.chain[b])
+        needed = (nodes.kept[a] & nodes.kept[b]) | _newest_between(nodes.submap[a], nodes.submap[b])
         needed |= np.arange(len(loops)) >= len(loops) - 2 * NEWEST
         stay = nodes.kept | (np.arange(count) >= count - NEWEST)
         stay[loops.ends[needed].ravel()] = True
-        for row in np.flatnonzero(nodes.chain[1:] != nodes.chain[:-1]).tolist():
+        for row in np.flatnonzero(nodes.submap[1:] != nodes.submap[:-1]).tolist():
             stay[max(row + 1 - AROUND_A_GAP, 0) : row + 2] = True
         rows = np.flatnonzero(stay)
         loops.keep(np.flatnonzero(needed))
@@ -128,7 +128,7 @@ class KeyframeGraph:
         """Whether odometry connects two keyframes without interruption."""
         row_a, row_b, nodes = self._row(a), self._row(b), self._nodes
         known = row_a < len(nodes) and nodes.kf_id[row_a] == a
-        return bool(known and nodes.chain[row_a] == nodes.chain[row_b])
+        return bool(known and nodes.submap[row_a] == nodes.submap[row_b])
 
     def same_view(self, kf_id: int, factor: float = 1.0) -> list[int]:
         """Keyframes with about the same pose, this one included, oldest first; within `factor` times the distance."""
@@ -144,9 +144,9 @@ class KeyframeGraph:
         return nodes.kf_id, poses
 
     def nearby(self, kf_id: int, excluded: Container[int]) -> list[int]:
-        """The nearest keyframe of the same chain with an overlapping view, if there is one."""
+        """The nearest keyframe of the same submap with an overlapping view, if there is one."""
         nodes, row = self._nodes, self._row(kf_id)
-        rows, metres, radians = self._around(nodes.odom_T_cam, row, nodes.chain, NEAR_METRES)
+        rows, metres, radians = self._around(nodes.odom_T_cam, row, nodes.submap, NEAR_METRES)
         difference = metres + 1 - np.cos(radians)
         for k in np.argsort(difference, kind="stable").tolist():
             if radians[k] < NEAR_RADIANS and int(nodes.kf_id[rows[k]]) not in excluded:
@@ -165,18 +165,18 @@ class KeyframeGraph:
         nodes, row_a, row_b = self._nodes, self._row(a), self._row(b)
         self._loops.append(1, ends=(row_a, row_b), a_T_b=a_T_b)
         nodes.anchored[row_b], nodes.frame[row_b] = nodes.anchored[row_a] @ a_T_b, nodes.frame[row_a]
-        keep, dropped = self._joined[int(nodes.chain[row_a])], self._joined[int(nodes.chain[row_b])]
-        self._joined = {chain: keep if group == dropped else group for chain, group in self._joined.items()}
+        keep, dropped = self._joined[int(nodes.submap[row_a])], self._joined[int(nodes.submap[row_b])]
+        self._joined = {submap: keep if group == dropped else group for submap, group in self._joined.items()}
 
     def gap_motion(self, a: int, b: int, a_T_b: F64) -> GapMotion | None:
-        """The motion over the shortest gap between two chains that a loop between them implies; None without a gap.
+        """The motion over the shortest gap between two submaps that a loop between them implies; None without a gap.
 
         Without tracking a robot may continue, stop, turn or accelerate by half: all its positions are in a ball around
         the middle of the distance at its last speed.
         """
         nodes = self._nodes
-        chains, chain_of = np.unique(nodes.chain, return_inverse=True)
-        group = np.array([self._joined[chain] for chain in chains.tolist()])[chain_of]
+        submaps, submap_of = np.unique(nodes.submap, return_inverse=True)
+        group = np.array([self._joined[submap] for submap in submaps.tolist()])[submap_of]
         ours = {group[self._row(a)], group[self._row(b)]}
         gaps = [
             (int(nodes.stamp_ns[k + 1] - nodes.stamp_ns[k]), k, velocity)
@@ -200,14 +200,14 @@ class KeyframeGraph:
         return GapMotion(deviation, tolerance, disturbed, before.metres + after.metres)
 
     def _velocity(self, row: int) -> F64 | None:
-        """(3,) metres a second before a keyframe, in its camera frame; None for the first of a chain.
+        """(3,) metres a second before a keyframe, in its camera frame; None for the first of a submap.
 
-        Over a second at least, if the chain is as long: what covers a camera disturbs its last few poses.
+        Over a second at least, if the submap is as long: what covers a camera disturbs its last few poses.
         """
         nodes = self._nodes
-        chain = np.flatnonzero(nodes.chain[:row] == nodes.chain[row])
-        early = chain[nodes.stamp_ns[chain] <= nodes.stamp_ns[row] - SPEED_NS]
-        before = int(early[-1]) if len(early) else int(chain[0]) if len(chain) else row
+        submap = np.flatnonzero(nodes.submap[:row] == nodes.submap[row])
+        early = submap[nodes.stamp_ns[submap] <= nodes.stamp_ns[row] - SPEED_NS]
+        before = int(early[-1]) if len(early) else int(submap[0]) if len(submap) else row
         if nodes.stamp_ns[row] <= nodes.stamp_ns[before]:
             return None
         step = se3.inverse(nodes.odom_T_cam[row]) @ nodes.odom_T_cam[before]
@@ -224,7 +224,7 @@ class KeyframeGraph:
     def _find_path(self, a: int, b: int) -> GraphPath | None:
         nodes, loops = self._nodes, self._loops.ends
         rows = np.unique(np.append(loops.ravel(), (self._row(a), self._row(b))))
-        linked = np.flatnonzero(nodes.chain[rows[:-1]] == nodes.chain[rows[1:]])
+        linked = np.flatnonzero(nodes.submap[rows[:-1]] == nodes.submap[rows[1:]])
         ends = np.concatenate([np.stack([linked, linked + 1], 1), np.searchsorted(rows, loops)])
         metres = np.zeros(len(ends))
         metres[: len(linked)] = nodes.distance[rows[linked + 1]] - nodes.distance[rows[linked]]
@@ -245,7 +245,7 @@ class KeyframeGraph:
 
 
 def _newest_between(a: I64, b: I64) -> Bool:
-    """(L,) which of loops between chains (L,) and (L,), in order of time, are the newest between two different ones."""
+    """(L,) which loops between submaps (L,) and (L,), in order of time, are the newest between two different ones."""
     _, pair = np.unique(np.stack([np.minimum(a, b), np.maximum(a, b)], 1), axis=0, return_inverse=True)
     pair = pair.ravel()
     order = np.argsort(pair, kind="stable")

@@ -26,7 +26,7 @@ class Columns:
     spec: ClassVar[Spec] = {}
 
     def __init_subclass__(cls) -> None:
-        cls.spec = {name: value for name, value in vars(cls).items() if isinstance(value, tuple)}
+        cls.spec = {name: value for name, value in vars(cls).items() if isinstance(value, tuple) and name[:2] != "__"}
 
     def __init__(self, capacity: int = 64) -> None:
         self._count = 0

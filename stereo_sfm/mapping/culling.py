@@ -106,13 +106,13 @@ def earlier_visits(map_: Map, newest: int, protected: Bool) -> I64:
     return earlier[~protected[earlier]]
 
 
-def loose_keyframes(map_: Map, settled: Bool, repeated: I64, config: MapperConfig) -> I64:
+def loose_keyframes(map_: Map, old_enough: Bool, repeated: I64, config: MapperConfig) -> I64:
     """Keyframes that have lost so many points that hardly anything holds them: adjusted, they would go anywhere.
 
     Fewer than make two keyframes neighbours; twice as many of those in `repeated`, whose views others have as well.
 
     Args:
-        settled: (K,) keyframes that may go. The first of a submap stays.
+        old_enough: (K,) keyframes that may go. The first of a submap stays.
     """
     keyframes, table = map_.keyframes, map_.observations
     seen = np.flatnonzero(table.pt >= 0)
@@ -120,7 +120,7 @@ def loose_keyframes(map_: Map, settled: Bool, repeated: I64, config: MapperConfi
     least = np.full(len(keyframes), config.connected_points)
     least[repeated] *= 2
     few = np.bincount(table.kf[shared], minlength=len(keyframes)) < least
-    return np.flatnonzero(keyframes.alive & settled & few & (keyframes.previous >= 0))
+    return np.flatnonzero(keyframes.alive & old_enough & few & (keyframes.previous >= 0))
 
 
 def _seen_by_others(map_: Map, rows: I64) -> F64:

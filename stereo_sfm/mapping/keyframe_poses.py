@@ -10,7 +10,7 @@ class KeyframePoses:
 
     def __init__(self) -> None:
         self._poses: dict[int, F64] = {}  # of living keyframes: map_T_kf
-        self._carried: dict[int, tuple[int, F64]] = {}  # of culled ones: carrier's id, carrier_T_kf
+        self._carried: dict[int, tuple[int, F64]] = {}  # of culled ones: reference keyframe's id, its pose in it
         self._all: dict[int, F64] | None = None  # what `all` gave last, until something changes
 
     def __len__(self) -> int:
@@ -35,7 +35,7 @@ class KeyframePoses:
             self._carried[kf_id] = carrier, carrier_T_kf.copy()
 
     def all(self) -> dict[int, F64]:
-        """map_T_kf (4, 4) by id, ascending, without keyframes whose carrier is unknown."""
+        """map_T_kf (4, 4) by id, ascending, without keyframes whose reference keyframe is unknown."""
         if self._all is None:
             self._all = self._put_together()
         return self._all

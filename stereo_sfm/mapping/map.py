@@ -30,8 +30,8 @@ class MapDelta:
 
     kf_rows: I64  # (K,) new or moved living keyframes, ascending
     map_T_kf: F64  # (K, 4, 4)
-    culled_kf: I64  # (R, 2) rows: a culled keyframe, the keyframe that carries it
-    carrier_T_kf: F64  # (R, 4, 4) its pose relative to the carrier
+    culled_kf: I64  # (R, 2) rows: a culled keyframe, its reference keyframe
+    carrier_T_kf: F64  # (R, 4, 4) its pose relative to the reference keyframe
     pt_rows: I64  # (P,) new or moved living points that have tracks, ascending
     xyz: F64  # (P, 3)
 
@@ -220,7 +220,7 @@ class Map:
         self._changed_kf.update(rows.tolist())
 
     def keyframe_poses(self) -> F64:
-        """(K, 4, 4) map_T_kf of every row; culled keyframes have moved with their carriers."""
+        """(K, 4, 4) map_T_kf of every row; culled keyframes have moved with their reference keyframes."""
         poses = self.keyframes.map_T_kf.copy()
         gone = np.flatnonzero(~self.keyframes.alive)
         poses[gone] = poses[self.keyframes.carrier[gone]] @ self.keyframes.carrier_T_kf[gone]
@@ -294,7 +294,7 @@ class Map:
                 self.motions[later] = joined
 
     def _carry(self, row: int) -> None:
-        """Make another keyframe the carrier of a keyframe and of those that it carries."""
+        """Make another keyframe the reference of a keyframe, and of those whose reference it was."""
         others, _ = self.neighbours(row)
         carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
         table = self.keyframes

@@ -274,7 +274,7 @@ def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words,
 
     Args:
         uv, uv_right: (N, 2) px observed, the right one NaN where unseen. words: (N, 4) uint64 descriptors, 0: none.
-        predicted, predicted_right, candidate_words: the same of (C,) candidates.
+        predicted, predicted_right, candidate_words: the corresponding ones of (C,) candidates.
         ratio: the best distance must be below `ratio` times the second best.
     """
     n, c = uv.shape[0], predicted.shape[0]

@@ -325,14 +325,14 @@ class Mapper(AnyMapper):
         offset = [np.eye(4) if e == r else keyframes.carrier_T_kf[r] for e, r in zip(ends, rows, strict=True)]
         ids, candidate_T_kf = keyframes.kf_id[ends].tolist(), offset[0] @ loop.candidate_T_kf @ se3.inverse(offset[1])
         matches = loop.matches
-        if ids[0] > ids[1]:  # the candidate's carrier is the newer one: swap, the candidate is the older keyframe
+        if ids[0] > ids[1]:  # the candidate's reference is newer: swap, the candidate is the older keyframe
             ids, candidate_T_kf, matches = ids[::-1], se3.inverse(candidate_T_kf), matches[:, ::-1]
         return dataclasses.replace(
             loop, candidate_kf_id=ids[0], kf_id=ids[1], candidate_T_kf=candidate_T_kf, matches=matches
         )
 
     def _carry_loops(self, culled_kf_id: int) -> None:
-        """Loops that end at a culled keyframe now end at its carrier: one for each pair, none where both ends coincide.
+        """Loops that end at a culled keyframe now end at its reference: one a pair, none where both ends coincide.
 
         If they kept their ends alive, a robot that goes round and round would have ever more keyframes.
         """

@@ -1,7 +1,7 @@
 """Motions in local bundle adjustment, by IMU, wheels and odometry: factors between successive keyframes.
 
 The residuals of preintegrated motions (Forster et al., On-Manifold Preintegration for Real-Time Visual-Inertial
-Odometry, TRO 2017, equation 45), random walks of the biases between them, and at the first keyframe of every chain what
+Odometry, TRO 2017, equation 45), random walks of the biases between them, and at the first keyframe of a submap what
 the tracker's filter knew of velocity, gravity and biases: all earlier samples, marginalised. The motions by wheels and
 by odometry are relative poses.
 
@@ -38,7 +38,7 @@ class InertialFactors:
     imu: Imu
     links: I64  # (L, 2) nodes
     motions: list[Preintegrated]  # (L,)
-    first: I64  # (C,) nodes at which chains begin
+    first: I64  # (C,) nodes at which submaps begin
     known: list[tuple[F64, F64] | None]  # (C,) their states as the tracker knew them, see `InertialLink.state`
     states: F64  # (N, 9) to begin with: velocity in the IMU's axes, biases of accelerometer and gyroscope
 
@@ -109,7 +109,7 @@ def motion_factors(map_: Map, rows: I64, fixed: Bool, imu: Imu | None) -> Motion
 def _inertial_factors(
     map_: Map, nodes: I64, links: I64, motions: list[Preintegrated | None], imu: Imu
 ) -> InertialFactors | None:
-    """None where the tracker knew gravity at no keyframe that begins a chain."""
+    """None where the tracker knew gravity at no keyframe that begins a submap."""
     links = links[[motion is not None for motion in motions]]
     first = np.setdiff1d(np.arange(len(nodes)), links[:, 1])
     known = [map_.known_states.get(row) for row in nodes[first].tolist()]
@@ -337,7 +337,7 @@ def _motion_rows(factors: InertialFactors, rot: F64, pos: F64, z: F64, gravity: 
 
 def _known_rows(imu: Imu, known: tuple[F64, F64] | None, rot: F64, state: F64, gravity: F64) -> tuple[F64, F64]:
     """Whitened rows (R, 18) over the step of the IMU's pose, its state and gravity, and residuals (R,), at the first
-    keyframe of a chain."""
+    keyframe of a submap."""
     if known is None:
         sigma = np.repeat([SPEED_SIGMA, imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
         rows = np.zeros((STATE, 18))

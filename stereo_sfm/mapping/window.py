@@ -48,8 +48,8 @@ def final_bundle_config(config: MapperConfig) -> BundleConfig:
 
     It converges, also in the weights, for which it has twice as many rounds, and in the scale, which is slow. With one
     loss over both images: where a match disagrees, because its window shows two surfaces, the pixel of the left image
-    is no better. (During the run the right images may all disagree for a while, after a knock, and the left ones hold
-    the map together.)
+    is no better. (During the run the right images may all disagree for a while, after a step of the rig, and the left
+    ones hold the map together.)
     """
     usual = bundle_config(config)
     return dataclasses.replace(

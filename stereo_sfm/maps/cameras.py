@@ -41,7 +41,7 @@ class MapCamera:
 
     @functools.cached_property
     def text(self) -> str:
-        """The same of equal calibrations."""
+        """The calibration as text: equal for equal calibrations."""
         return rig_to_text(self.calibrated)
 
 

@@ -19,7 +19,7 @@ THICK_M = 0.05  # metres, of a level: stereo points of a floor a metre or two aw
 
 def find_floor(s: MapSnapshot) -> F64:
     """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
-    felt = s.down_sigma > 0  # gravity, where an IMU told it
+    felt = s.down_sigma > 0  # gravity, where an IMU measured it
     down = (s.map_T_kf[felt, :3, :3] @ s.down[felt, :, None])[..., 0].mean(0) if felt.any() else _upright(s)
     if np.linalg.norm(down) < 0.3:
         raise StereoSfmError(

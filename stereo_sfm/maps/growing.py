@@ -193,8 +193,8 @@ class GrowingMap:
             if new[k]:
                 odometry = self._odometry[keyframe.kf_id]
                 stamp = keyframe.stamp_ns - int(s.stamp_ns[0])
-                chain = keyframe.submap_id + 1
-                self._queue.append(dataclasses.replace(keyframe, odom_T_cam=odometry, submap_id=chain, stamp_ns=stamp))
+                submap = keyframe.submap_id + 1
+                self._queue.append(dataclasses.replace(keyframe, odom_T_cam=odometry, submap_id=submap, stamp_ns=stamp))
 
     def _new_closer(self) -> LoopCloser:
         """It knows the saved map, which is one rigid piece."""

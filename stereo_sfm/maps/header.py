@@ -51,7 +51,10 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None
     if version not in (2, SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE):
-        raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")
+        raise StereoSfmError(
+            f"the map {folder} is version {version}, this program reads version {VERSION}: make the map again, or "
+            "use the stereo-sfm that wrote it"
+        )
     for name in COUNTS:
         if type(head.get(name)) is not int or head[name] < 0:
             raise damaged(folder, f"map.json has no number '{name}'")

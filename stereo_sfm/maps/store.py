@@ -93,7 +93,7 @@ def _written(store: Path) -> tuple[int, int] | None:
 
 
 def lock_versioned(folder: Path) -> AbstractContextManager[object]:
-    """The same of a map folder that is a store; any other is not locked.
+    """Lock a map folder if it is a store; any other is not locked.
 
     Raises:
         StereoSfmError: another process writes to it.

@@ -50,7 +50,7 @@ class RotationFilter:
         return None if axes is None else odom_R_cam.T @ axes
 
     def correct(self, odom_R_cam: F64, found: Manhattan) -> F64:
-        """The rotation after a measurement; unchanged while the axes are not found or when it is refused."""
+        """The rotation after a measurement; unchanged while the axes are not known or when it is refused."""
         seen = odom_R_cam @ found.cam_R_axes
         if self._odom_R_axes is None:
             self._settle(seen)

@@ -83,6 +83,7 @@ class Session:
         self._lock: FolderLock | None = None  # on the folder, until its last file is written
         self._began = False  # a frame has come
         self._compilation: Compilation | None = None  # in this process
+        self._compiled_s = 0.0  # of it while the source was opened
         self.info: SourceInfo
 
     @property
@@ -98,6 +99,7 @@ class Session:
             with ExitStack() as stack:
                 self._frames = self._enter_inline(stack) if self._wiring.inline else self._enter_processes(stack)
                 self._stack = stack.pop_all()
+            self._compiled_s = 0.0 if self._compilation is None else self._compilation.seconds
         except StereoSfmError as error:
             self._clean_up(error)
             raise
@@ -159,7 +161,7 @@ class Session:
     def waited_s(self, begin_s: float) -> float:
         """Seconds after `begin_s` (performance counter) in which stages loaded or compiled their code."""
         if self._run is None:
-            return 0.0 if self._compilation is None else self._compilation.seconds
+            return 0.0 if self._compilation is None else self._compilation.seconds - self._compiled_s
         return max((self._run.began_s or begin_s) - begin_s, 0.0)
 
     def _name_folder(self, otherwise: str) -> Path:

@@ -79,7 +79,9 @@ class StageProcesses:
                 time.sleep(ATTEMPT_S)
         finally:
             self._starting = False
-        raise StereoSfmError("the process that starts the stages was killed again and again")
+        raise StereoSfmError(
+            "the process that starts the stages was killed again and again: is memory short? try --inline"
+        )
 
     def give_up(self) -> None:
         """Start no more stages, and wait no longer for the fork server, which may still load its code."""

@@ -222,7 +222,7 @@ class MapKeeper:
             StereoSfmError: not a plain name.
         """
         if not name or name.startswith(".") or Path(name).name != name or "\\" in name:
-            raise StereoSfmError(f"'{name}' is not a plain name")
+            raise StereoSfmError(f"'{name}' is not a plain name: leave out / and \\, and do not begin with a dot")
         return self.folder.with_name(name)
 
     def _save_when_due(self, session: Session | None) -> None:

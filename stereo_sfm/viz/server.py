@@ -90,10 +90,12 @@ def _wait_for(process: subprocess.Popen[Any], address: str, *ports: int) -> None
     until = time.monotonic() + START_S
     while not all(_answers(address, port) for port in ports):
         if process.poll() is not None:
-            raise StereoSfmError(f"cannot open the viewer: rerun ended with exit code {process.returncode}")
+            raise StereoSfmError(
+                f"cannot open the viewer: rerun ended with exit code {process.returncode}; try --viz serve or save"
+            )
         if time.monotonic() > until:
             process.kill()
-            raise StereoSfmError(f"cannot open the viewer: rerun has not started after {START_S:.0f} s")
+            raise StereoSfmError(f"cannot open the viewer: rerun has not started after {START_S:.0f} s; try --viz save")
         time.sleep(0.05)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,11 @@ from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.types import U8
 
 Change = Callable[[s.StereoImage], s.StereoImage]
+
+
+def slow(*values: object) -> Any:
+    """A case that takes seconds and has a sibling among the fast tests."""
+    return pytest.param(*values, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +103,7 @@ def wrong(rig: s.Rig, x_deg: float = 0.0, z_deg: float = 0.0, rows: float = 0.0)
 ERRORS = {"x": {"x_deg": 2.0}, "z": {"z_deg": -2.0}, "both": {"x_deg": -1.0, "z_deg": 1.5}, "rows": {"rows": -6.0}}
 
 
-@pytest.mark.parametrize("name", ERRORS)
+@pytest.mark.parametrize("name", ["both", "rows", slow("x"), slow("z")])
 def test_a_large_error_is_found_and_corrected(pair: tuple[s.Rig, list[s.StereoImage]], name: str) -> None:
     rig, images = pair
     found = check_start(wrong(rig, **ERRORS[name]), images)
@@ -116,7 +122,7 @@ def test_small_errors_and_right_calibrations_stay(pair: tuple[s.Rig, list[s.Ster
     assert check_start(wrong(rig, z_deg=0.05), images).rig is None
 
 
-@pytest.mark.parametrize(("name", "shift"), [("kitti", -2), ("kitti", 1), ("store_walk", 2)])
+@pytest.mark.parametrize(("name", "shift"), [slow("kitti", -2), ("kitti", 1), ("store_walk", 2)])
 def test_images_paired_frames_apart_are_found(data_root: Path, name: str, shift: int) -> None:
     with s.open_source(data_root / name) as source:
         rig, images = source.rig, list(islice(source, 17))
@@ -139,7 +145,7 @@ def misread(camera: Camera, model: type[Camera]) -> Camera:
     return model(*camera.size, camera.fx, camera.fy, camera.cx, camera.cy, distortion)
 
 
-@pytest.mark.parametrize("cameras", ["both", "left"])
+@pytest.mark.parametrize("cameras", ["both", slow("left")])
 @pytest.mark.parametrize(("name", "wrong_model"), [("store_walk", RadTan), ("euroc_mh01", KannalaBrandt)])
 def test_a_lens_under_the_name_of_another_model(
     data_root: Path, name: str, wrong_model: type[Camera], cameras: str
@@ -155,8 +161,10 @@ def test_a_lens_under_the_name_of_another_model(
     assert check_start(found.rig, images).text == ""
 
 
-@pytest.mark.parametrize("name", ["store_walk", "euroc_mh01"])
-@pytest.mark.parametrize("rectified", [False, True])
+@pytest.mark.parametrize(
+    ("name", "rectified"),
+    [("store_walk", False), ("euroc_mh01", True), slow("store_walk", True), slow("euroc_mh01", False)],
+)
 def test_images_that_are_rectified_or_not_against_their_name(data_root: Path, name: str, rectified: bool) -> None:
     with s.open_source(data_root / name) as source:
         rig, images = source.rig, list(islice(source, 13))

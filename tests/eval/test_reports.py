@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 import xml.etree.ElementTree as ElementTree
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,16 @@ import pytest
 
 from stereo_sfm import timing
 from stereo_sfm.cli import main
+from stereo_sfm.config import Config
+from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.eval.compare import names_of
 from stereo_sfm.eval.headline import headline
 from stereo_sfm.eval.html_page import take_plots, to_html
 from stereo_sfm.eval.report import verdicts
 from stereo_sfm.eval.tables import write_table
 from stereo_sfm.kernel_cache import Compilation
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.pipeline.session import Session, Wiring
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +90,22 @@ def test_compiling_is_no_time_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> Non
     assert 0 <= spans.take()["track"] < 20
 
 
+def test_compiling_while_the_source_is_opened_is_no_time_of_the_run(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The run's time begins afterwards: it would be shorter than none."""
+    counted = Compilation(lambda _: None)
+    counted.seconds = 60.0
+    monkeypatch.setattr("stereo_sfm.kernel_cache.listening", lambda _: nullcontext(counted))
+    choice = SourceChoice("sim:aisle?size=64x48&frames=2")
+    with Session(choice, Config(), [], Wiring(inline=True, log="none"), MapFolders(), tmp_path / "run") as session:
+        assert session.waited_s(time.perf_counter()) == 0.0
+        counted.seconds += 2.0
+        assert session.waited_s(time.perf_counter()) == 2.0
+        session.stop()
+    session.close()
+
+
 def test_other_files_of_the_folder_stay(tmp_path: Path) -> None:
     (tmp_path / "mine.svg").write_text("<svg/>")
     assert not take_plots(tmp_path, ["trajectory"]) and (tmp_path / "mine.svg").exists()
@@ -132,7 +153,7 @@ def test_two_runs_differ_as_a_table(
     assert main(["diff", *map(str, runs), "-o", str(tmp_path)]) == 3
     rows = {line.split("  ")[0]: line.split() for line in capsys.readouterr().out.splitlines()}
     assert rows["run"][1:] == ["a", "b"] and rows["tracker.max_features"][1:] == ["150", "80"]
-    assert rows["hash"][1] != rows["hash"][2] and {"ATE m", "lost intervals", "corrections"} <= rows.keys()
+    assert rows["hash"][1] != rows["hash"][2] and {"ATE", "lost intervals", "corrections"} <= rows.keys()
     assert not any(name.startswith("/") for name in rows)  # no topic
     assert (tmp_path / "compare.html").is_file()
     assert main(["diff", *map(str, runs), "--all"]) == 3 and "/" in capsys.readouterr().out

@@ -70,6 +70,8 @@ compile_share(Config(), RIGS[sys.argv[1]])
 print(*sorted(set(late)))
 """
 SIMULATED = "sim:people?frames=40&size=320x200&vibration=2"
+# A process of some ten seconds each: the lenses of most cameras by default, the others with the slow tests.
+ONE_OF_EACH = [pytest.param(name, marks=() if name in ("fisheye", "radtan") else pytest.mark.slow) for name in RIGS]
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -107,14 +109,14 @@ def test_nothing_is_compiled_after_the_warm_up_of_a_real_camera(name: str, data_
     assert late_kernels(str(data_root / name)) == []
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("rig", ONE_OF_EACH)
 def test_a_helper_compiles_only_what_the_tracker_needs(rig: str) -> None:
     child = subprocess.run([sys.executable, "-c", SHARED, rig], capture_output=True, text=True, env=dict(os.environ))
     assert child.returncode == 0, child.stderr
     assert child.stdout.split() == []
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("rig", ONE_OF_EACH)
 def test_the_last_images_of_the_warm_up_show_two_motions(rig: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
     errors_at = pose_solver.errors_at

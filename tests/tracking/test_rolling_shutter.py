@@ -153,10 +153,11 @@ def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
     return evaluate(Trajectory(np.array([f.stamp_ns for f in frames]), poses), truth).ape_m.rmse * 1e3
 
 
-def test_a_rendered_sequence_with_a_rolling_shutter() -> None:
+@pytest.mark.parametrize("seeds", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_a_rendered_sequence_with_a_rolling_shutter(seeds: int) -> None:
     """A camera with vibration and a readout of 25 ms: much more accurate than without the model."""
     known, unknown = list[float](), list[float]()
-    for seed in range(3):
+    for seed in range(seeds):
         spec = f"sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025&seed={seed}"
         with open_source(spec) as source:
             images, truth = list(source), source.ground_truth

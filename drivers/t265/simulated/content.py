@@ -86,7 +86,7 @@ def source_content(spec: str, frames: int) -> Content:
                 break
         truth = source.ground_truth
     if not images:
-        raise StereoSfmError(f"{spec} has no images")
+        raise StereoSfmError(f"{spec} has no image pairs to show")
     if truth is None:
         still = np.eye(4)
         return Content(rig, images, lambda t: np.broadcast_to(still, (len(t), 4, 4)))

@@ -218,8 +218,11 @@ def _read(path: Path) -> str:
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), encoding="ascii") as file:
             mode = os.fstat(file.fileno()).st_mode
             text = file.read(MOST_TOKEN + 1).strip() if stat.S_ISREG(mode) else ""
-    except (OSError, ValueError):
-        raise StereoSfmError(f"cannot read the token in {path}") from None
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not plain text"
+        raise StereoSfmError(
+            f"cannot read the token in {path}: {why}; name another file (security.token_file)"
+        ) from None
     if mode & stat.S_IRWXO:
         raise StereoSfmError(f"{path}: everyone on this computer can use this token: chmod 640 {path}")
     if not LEAST_TOKEN <= len(text) <= MOST_TOKEN or not text.isprintable():

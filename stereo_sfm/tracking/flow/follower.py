@@ -115,11 +115,11 @@ class Follower:
         return float(np.minimum(cells, CELL_POINTS).sum())
 
     def forget(self) -> None:
-        """Give up the held image: a new odometry begins."""
+        """Give up the reference image: a new odometry begins."""
         self._held = None
 
     def renewed(self, held: Held) -> Tracks:
-        """The points of the held image, with their appearance in it instead of their first one."""
+        """The points of the reference image, with their appearance in it instead of their first one."""
         rows, slots = self.begin(held.images.left, held.tracks.uv, held.pose)
         tracks = held.tracks.keep(_mask(rows, len(held.tracks)))
         tracks.slot, tracks.warp = slots, np.tile(np.eye(2), (len(rows), 1, 1))

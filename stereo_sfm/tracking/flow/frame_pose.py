@@ -35,7 +35,7 @@ from stereo_sfm.types import F64, Bool
 # a near edge crosses a far one, people who walk along) have one-sided errors, which bias the scale.
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
 REAPPEARED_NOISE = 1.0  # over config.sigma_px, at least: windows that changed much are found less exactly
-BLURRED_NOISE = 2.0  # the same of windows in a blurred image
+BLURRED_NOISE = 2.0  # the same for windows in a blurred image
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 10.0)  # over config.sigma_px: the noise of the best images, and what still is a match
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
@@ -49,7 +49,7 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 # are static and of an unobstructed view, are believed whatever the motion.
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
-# the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they pull it
+# the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they move it
 # away: by 14 at most in 700 images of stores without people and of EuRoC. If by more than has 1 % of six degrees of
 # freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
 NEARER, PULL_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
@@ -179,7 +179,7 @@ class FramePoseSolver:
     def _contradicted(
         self, tracks: Tracks, expected: ExpectedMotion, best: PoseSolution
     ) -> tuple[PoseSolution, Bool, Bool] | None:
-        """The pose without points that those known for long contradict; None: there are none.
+        """The pose without points that points tracked for long contradict; None: there are none.
 
         Suspected are new points that are nearer, and all beside a moving one. Returns also which are left out (N,), and
         which of them move (N,).
@@ -216,7 +216,7 @@ class FramePoseSolver:
         return None
 
     def _pulling(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
-        """(N,) the `points` (N,), if they are so many and pull a pose away from where all others have it; else none."""
+        """(N,) the `points` (N,), if they are so many and shift the pose from where all others have it; else none."""
         pulling = np.count_nonzero(points) >= least and self.pull(tracks.keep(points), best) >= PULL_CHI2
         return points & pulling
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-COVERED_SHARE = 0.1  # of the time that the view is covered: counts as time with a free view
+COVERED_SHARE = 0.1  # of the time that the view is covered: counts as time with an open view
 
 
 class Loss:
     """One `add` per image without a pose, one `end` per image with one."""
 
     def __init__(self, longest_s: float) -> None:
-        """`longest_s`: with a free view but no pose, after which tracking begins anew."""
+        """`longest_s`: with an open view but no pose, after which tracking begins anew."""
         self._longest_s = longest_s
         self.frames = 0  # successive ones without a pose
         self._last_ns = 0  # the last of them

@@ -1,7 +1,7 @@
 """Poses found while a part of the view was covered, to be found anew once more of it is free.
 
 What is left of a view may be one wall, before which a turn and a shift look alike: errors of some centimetres and half
-a degree. New points inherit them. The held image, from before the cover, does not have them.
+a degree. New points inherit them. The reference image, from before the cover, does not have them.
 """
 
 from __future__ import annotations

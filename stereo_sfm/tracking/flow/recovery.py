@@ -32,13 +32,13 @@ MIN_INLIER_SHARE = 0.6  # of the points that are found
 # where lamps are taken for the next ones, have 0.43 to 0.64; right poses after 3 to 4 m without sight 0.69 to 0.84.
 MIN_RECALL, RECALL_PER_METRE, RECALL_PER_SIGMA = 0.1, 0.7, 0.1
 MAX_SIGMA_M = 0.8
-# Of the cells with corners in the newest keyframes, row by row, with which the view is free again. A free view has 0.63
+# Of the cells with corners in the newest keyframes, row by row, with which the view is free again. An open one has 0.63
 # of them at least, also after a turn; the rim around a cover 0.47 at most, although it has half as many cells.
 FREE_SHARE = 0.5
 
 
 class Recovery:
-    """The trusted motion and the newest keyframes, for relocalization."""
+    """The motion prior and the newest keyframes, for relocalization."""
 
     def __init__(self, place_corners: PlaceCorners | None, places: Places | None, size: tuple[int, int]) -> None:
         """`size`: width and height of the left image. Without `places` there is no search."""

@@ -413,7 +413,7 @@ class Tracker:
         return None if self._sensors is None else self._sensors.bridge(stamp_ns)
 
     def _expect(self, stamp_ns: int, bridge: tuple[F64, F64] | None) -> Expectation:
-        """The predicted pose of a lost camera: by IMU and wheels, else by the last trusted motion."""
+        """The predicted pose of a lost camera: by IMU and wheels, else by the motion prior."""
         return self._recovery.motion.expect(stamp_ns) if bridge is None else Expectation.of(*bridge)
 
     def _search(self, image: StereoImage, images: StereoPyramids) -> tuple[Tracks, PoseSolution]:
@@ -467,7 +467,7 @@ class Tracker:
     def _track_from(
         self, pose: F64, images: StereoPyramids, seconds: float, known: Sequence[F64] = ()
     ) -> tuple[Tracks, PoseSolution]:
-        """Find the points of the held image from an approximate pose (4, 4), and again from the results.
+        """Find the points of the reference image from an approximate pose (4, 4), and again from the results.
 
         No pose is found where the first result is near a `known` one (4, 4), to which the others would lead again.
         """
@@ -492,7 +492,7 @@ class Tracker:
             self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose, later)
 
     def _hold_more(self) -> None:
-        """Add points to the held image: from far away most of those that were tracked are out of view."""
+        """Add points to the reference image: from far away most of those that were tracked are out of view."""
         held = self._follower.held
         if not held.dense:
             most = HELD_POINTS * self._config.max_features
@@ -502,7 +502,7 @@ class Tracker:
             self._follower.keep_only(self._tracks)
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
-        """Predict the pose; after some time with a free view start a new submap."""
+        """Predict the pose; after some time with an open view start a new submap."""
         bridge = self._bridge(image.stamp_ns)
         expected = self._expect(image.stamp_ns, bridge)
         self._follower.search_widely()

@@ -1,4 +1,4 @@
-"""Prediction of the pose during a loss of tracking, from the last second of trusted motion.
+"""Prediction of the pose during a loss of tracking, from the motion of the last good second.
 
 The covariance grows with the possible accelerations and turns of a robot.
 """
