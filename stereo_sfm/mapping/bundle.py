@@ -33,7 +33,7 @@ MEDIAN_CHI2 = 2.0 * float(np.log(2.0))  # sigmas^2, of two dimensions
 TO_SIGMA = 1.4826  # from the median of absolute values, of normally distributed ones: 1 / Phi^-1(3/4)
 CHI2_2DOF_99 = chi_squared(0.99, 2)  # sigmas^2, of a pixel: one of a hundred right ones is left out
 MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual: exact data have none, and a scale of zero
-MIN_DISPARITY_SIGMA = 1e-2  # sigmas, the same of the points' mean disparity errors
+MIN_DISPARITY_SIGMA = 1e-2  # sigmas, lower bound of the points' mean disparity errors
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
 

@@ -32,7 +32,7 @@ DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandth
 NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit
 LENSES = slice(5, 8)  # focal ratio and decentering
 LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these
-# Prior standard deviations of the terms, radians, radians, ratio, radians: wide enough for a knock of half a degree.
+# Prior standard deviations of the terms, radians, radians, ratio, radians: wide enough for a step of half a degree.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
 # Prior standard deviations of `_shapes`, px at the image's border.
