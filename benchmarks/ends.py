@@ -1,0 +1,67 @@
+"""SIGTERM to a running service beside busy loops, again and again: how long until it has ended, and is the map saved.
+
+    python -m benchmarks ends -- [--count 50] [--busy 8] [--seconds 5]
+
+Each service plays the bundled recording with page, Foxglove and pose socket on, and records. It gets the signal some
+seconds after its first pose. The exit code is the number of ends that took longer than 5 s or left no map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.attack import STOP_S, Target, running
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.maps.saved_map import load_map
+
+
+def end(target: Target) -> tuple[float, int, int]:
+    """Seconds from SIGTERM to the exit, exit code, keyframes of the saved map."""
+    begin = time.monotonic()
+    target.process.send_signal(signal.SIGTERM)
+    with suppress(subprocess.TimeoutExpired):
+        target.process.wait(4 * STOP_S)
+    seconds = time.monotonic() - begin
+    try:
+        return seconds, target.process.returncode, len(load_map(target.folder / "store"))
+    except StereoSfmError:
+        return seconds, target.process.returncode, 0
+
+
+def main(args: list[str] | None = None) -> int:
+    """Print each end and the sum."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=50, metavar="N")
+    parser.add_argument("--busy", type=int, default=8, metavar="N", help="busy loops beside it")
+    parser.add_argument("--seconds", type=float, default=5.0, help="from the first pose to the first signal; then more")
+    o = parser.parse_args(args)
+    took, good = list[float](), 0
+    with ExitStack() as beside:
+        for _ in range(o.busy):
+            loop = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            beside.callback(loop.kill)
+        for k in range(o.count):
+            with running(0) as target:
+                time.sleep(o.seconds * (1 + k % 3))
+                seconds, code, keyframes = end(target)
+            took.append(seconds)
+            good += seconds <= STOP_S and code == 0 and keyframes > 0
+            last = target.said.strip().splitlines()[-1:] or [""]
+            print(f"  {seconds:5.2f} s, exit code {code}, {keyframes} keyframes  {last[0][:100]}", flush=True)
+    print(f"load {os.getloadavg()[0]:.1f}; {good} of {o.count} within {STOP_S:g} s with a map, "
+          f"median {statistics.median(took):.2f} s, the longest {max(took):.2f} s")  # fmt: skip
+    return o.count - good
+
+
+if __name__ == "__main__":
+    sys.exit(main())
