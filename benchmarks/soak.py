@@ -1,6 +1,7 @@
 """The service for hours of camera time, with everything that goes wrong on a robot: what grows, what recovers.
 
-    python -m benchmarks soak -- [--minutes 240] [--realtime 30] [--most MINUTES] [--source SPEC] [--work DIR]
+    python -m benchmarks soak -- [--minutes 240] [--realtime 30] [--attacks] [--most MINUTES]
+                               [--source SPEC] [--work DIR]
 
 Images come from memory, a lap through the store there and back again and again: first at 30 Hz by the clock, for an
 eighth of the time, then as fast as the pipeline takes them. The camera is unplugged, the lights go out, the disk fills
@@ -8,6 +9,9 @@ up (by its limits), each stage is killed or stopped; the last part is left alone
 but ROS 2, and a client reads the pose socket. Printed: the resident memory of each process with its slope per hour of
 camera time (without the first half hour after its start), every fault and how long it took, missing poses, dropped
 images, delays in the part by the clock, recordings against their quota. The exit code is 1 if anything is wrong.
+
+With `--attacks`, minutes without and with attacks, and both beside eight busy loops, alternate in the part by the
+clock; printed is how many poses of each were late. Not more may be with attacks than without.
 """
 
 from __future__ import annotations
@@ -33,6 +37,9 @@ from typing import Any
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks._soak_attacks import Turns
 from stereo_sfm.calib.formats.native import read_native, write_native
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.drivers.source import BaseSource, open_source
@@ -66,6 +73,7 @@ QUOTA_GB, SEGMENT_MIN = 0.4, 0.1
 SIZES_EVERY = 60  # reports, each of a second: what is kept of them grows, too
 RESTART_S = 5.0  # from the death of a stage to the next pose
 FOUND_FRAMES = 300  # for a pose after the lights are on again
+TOKEN = "of-the-soak-and-its-client"
 SOCKET_PORT, FOXGLOVE_PORT, PAGE_PORT = 17100, 18865, 18180
 
 
@@ -147,6 +155,7 @@ class Watch:
     over_quota: float = 0.0
     tracked: bool = False
     session: int = 0
+    turns: Turns | None = None
 
     def pose(self, pose: PoseUpdate) -> None:
         if pose.frame_id > self.frame + 1:
@@ -160,11 +169,15 @@ class Watch:
         self.untracked += not pose.tracked
         if pose.frame_id < self.by_clock:
             self.arrived.extend((pose.captured_s, time.monotonic()))
+            if self.turns is not None:
+                self.turns.pose(pose.captured_s)
 
     def start(self, started: Started) -> None:
         if started.session > self.session:  # else it tells how the camera is mounted
             self.session = started.session
             self.sessions.append(self.frame + 1)
+            if self.turns is not None:
+                self.turns.session()
 
     def status(self, status: Status) -> None:
         if not self.states or self.states[-1][1] != status.state:
@@ -273,6 +286,7 @@ def read_poses(send: Any) -> None:
     seen, missed, gaps, last = 0, 0, list[tuple[int, int]](), (-1, -1)
     with suppress(OSError):
         connection = connected(time.monotonic() + SETTLE_S)
+        connection.sendall(TOKEN.encode() + b"\n")
         for line in connection.makefile():
             pose = json.loads(line)
             now, stated = (pose["session"], pose["frame_id"]), pose["missed"]
@@ -289,7 +303,8 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
     by_clock = int((o.minutes / 8 if o.realtime is None else o.realtime) * 60 * RATE)
     store(o.source, o.distinct, work)
     events, unplugged, dark = plan(count, o.times, o.kills)
-    watch, wrong, took = Watch(by_clock=by_clock), list[str](), list[tuple[int, str, float]]()
+    turns = Turns(work, PAGE_PORT, FOXGLOVE_PORT, SOCKET_PORT) if o.attacks else None
+    watch, wrong, took = Watch(by_clock=by_clock, turns=turns), list[str](), list[tuple[int, str, float]]()
     source = MadeSource.of(StoreCamera, work, count, unplugged, dark, by_clock)
     spawn = multiprocessing.get_context("spawn")
     receive, send = spawn.Pipe(False)
@@ -304,6 +319,9 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
         service.on(Started, watch.start)
         observing = threading.Thread(target=observe, args=(service, work / "recordings", watch, count), daemon=True)
         observing.start()
+        if turns is not None:
+            wait_for(lambda: watch.poses)
+            turns.start()
         for frame, fault in events:
             while watch.frame < frame and not service.wait(0.05):
                 pass
@@ -317,6 +335,8 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
         while not service.wait(1.0):
             if o.most is not None and time.monotonic() - began > 60 * o.most:
                 break
+        if turns is not None:
+            turns.end()
         stop_s = time.monotonic()
     print(f"{watch.frame + 1} frames, {watch.frame / RATE / 60:.0f} of {o.minutes:g} min of camera time "
           f"in {(time.monotonic() - began) / 60:.1f} min")  # fmt: skip
@@ -324,6 +344,7 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
           f"ended in {time.monotonic() - stop_s:.1f} s")  # fmt: skip
     socket_seen = receive.recv() if receive.poll(10.0) else None
     wrong += judge_memory(watch) + judge_poses(watch, dark, socket_seen) + judge_faults(watch, o.times)
+    wrong += turns.judge() if turns is not None else []
     return wrong + judge_recordings(watch, work / "recordings") + judge_clock(watch)
 
 
@@ -336,6 +357,10 @@ def outputs_here() -> set[str]:
 def configuration(work: Path) -> RobotConfig:
     """A map that is saved, a black box with a small quota, and outputs."""
     here = outputs_here()
+    token = work / "state" / "stereo-sfm" / "token"
+    token.parent.mkdir(parents=True, exist_ok=True)
+    token.touch(0o600)
+    token.write_text(TOKEN)
     return RobotConfig(
         map=MapConfig(str(work / "store"), "extend", 5.0),
         recording=RecordingConfig(
@@ -347,7 +372,7 @@ def configuration(work: Path) -> RobotConfig:
             FoxgloveConfig("foxglove" in here, port=FOXGLOVE_PORT),
         ),
         page=PageConfig("page" in here, port=PAGE_PORT),
-        security=SecurityConfig(auth="none"),
+        security=SecurityConfig(token_file=str(token)),
     )  # fmt: skip
 
 
@@ -447,6 +472,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--source", default="sim:loop?size=424x400")
     parser.add_argument("--realtime", type=float, help="minutes at the beginning that come by the clock")
     parser.add_argument("--most", type=float, help="minutes by the clock after which it ends, whatever is left")
+    parser.add_argument("--attacks", action="store_true", help="and busy loops, in turn with minutes without")
     parser.add_argument("--distinct", type=int, default=1260, help="images in memory: one lap")
     parser.add_argument("--times", type=int, default=10, help="unplugged and dark so often")
     parser.add_argument("--kills", type=int, default=3, help="of each stage")

@@ -39,7 +39,8 @@ log = logging.getLogger("stereo_sfm")
 SINKS = {"logger", "viewer"}
 CHECK_S = 0.25  # between two checks for processes that do not respond
 STOP_GRACE_S = 2.0  # time for capture to react to a stop
-SAVE_END_S = 4.2  # instead of END_S while the map of a session is being written
+IN_FLIGHT_S = 1.0  # time after a stop for images in flight, where the map is written: 0.1 s on a quiet computer
+SAVE_END_S = 3.9  # instead of END_S while the map of a session is being written
 END_S = 3.0  # time for a live run to end after a stop; for others, the longest time without a message
 VIEWER_GRACE_S = 10.0  # time for the viewer to show waiting messages after the run
 
@@ -110,6 +111,7 @@ class ProcessRun:
         self._held: dict[str, list[object]] = {}  # requests to a stage that begins later than others
         self._set_up_sent = False  # before it, capture takes no other message
         self._saving_at_end = False  # an urgent save was requested, and is not done
+        self._saved_at_end = False  # it is done
         self._stopped_s: float | None = None  # when a stop was requested
         self._progress_s = time.monotonic()  # of the last message other than a heartbeat
         self._next_check_s = self._received_s = time.monotonic()
@@ -247,18 +249,23 @@ class ProcessRun:
         """After a stop request: end the stages that do not end by themselves.
 
         A stage may take time while it works: for a map to be saved as long as it needs, for files as long
-        as it makes progress, for a live camera `END_S`.
+        as it makes progress, for a live camera `END_S`, for a service whose map is written `IN_FLIGHT_S`.
         """
         if waited_s > STOP_GRACE_S and "capture" in self._stages.waiting:
             self._stages.processes["capture"].kill()  # it is waiting for an image
             return
         hurry = bool(silent) or self._folders.map_out is None or bool(self._not_ready)
-        if self._saving_at_end and not silent and waited_s <= SAVE_END_S:
+        maps = "mapper" not in self._not_ready  # else there is nothing to save yet
+        if self._saving_at_end and maps and not silent and waited_s <= SAVE_END_S:
             return
+        if waited_s > IN_FLIGHT_S and (self._saved_at_end or (self._saving_at_end and not maps)):
+            self._end_now()
         if waited_s > END_S and hurry and (self._live or self._not_ready or now - self._progress_s > END_S):
             self._end_now()
 
     def _end_now(self) -> None:
+        if self._saving_at_end and "mapper" in self._not_ready:
+            self._dispatch(MapSaved("", 0, "nothing is mapped yet"))
         missing = " and the ".join(sorted(self._stages.waiting - {"viewer"}))
         log.warning("ended without waiting for the %s", missing)
         self._abandon()
@@ -384,7 +391,8 @@ class ProcessRun:
         if isinstance(message, LoopResult):
             self._loop.answered(message, data or pickled(message))
         if isinstance(message, Compiling | Localized | MapSaved):
-            self._saving_at_end &= not isinstance(message, MapSaved)
+            if isinstance(message, MapSaved) and self._saving_at_end:
+                self._saving_at_end, self._saved_at_end = False, True
             for sink in self._sinks:
                 sink.put(message)
             return

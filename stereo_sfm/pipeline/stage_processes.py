@@ -149,8 +149,9 @@ class StageProcesses:
             for stage in ended & self.processes.keys():
                 self.processes[stage].join(max(until - time.monotonic(), 0.0))
             self.kill()
+            until = time.monotonic() + EXIT_S
             for process in self.processes.values():
-                process.join(EXIT_S)
+                process.join(max(until - time.monotonic(), 0.0))
         finally:
             for end in (*self.reports, *self._controls.values()):
                 end.close()

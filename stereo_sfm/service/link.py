@@ -25,7 +25,7 @@ from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.service.child import Send, follow, pipe, run_child, start_child
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import ServiceMessage
-from stereo_sfm.service.outputs import OUTPUTS
+from stereo_sfm.service.outputs import OUTPUTS, TIDY
 from stereo_sfm.service.publisher import Publisher, Reply
 
 log = logging.getLogger(LOGGER)
@@ -206,7 +206,7 @@ def run_output(
                 publisher.put(pickle.loads(messages.recv_bytes()))
         publisher.close()
 
-    run_child(f"output {name}", to_main, body, tidy=True)
+    run_child(f"output {name}", to_main, body, tidy=name in TIDY)
 
 
 def make_publisher(module: str, config: RobotConfig) -> Publisher:

@@ -62,6 +62,11 @@ class Pipelines:
         self.map_complete = False  # the last session's mapper came to its end
 
     @property
+    def stopping_s(self) -> float:
+        """Seconds since the stop, 0 before it."""
+        return time.monotonic() - self.stopped_s if self.stopping.is_set() else 0.0
+
+    @property
     def tracking_session(self) -> Session | None:
         """The session, once its first image has come."""
         return None if self._facts.starting else self.session

@@ -38,6 +38,8 @@ log = logging.getLogger(LOGGER)
 CHECK_S = 0.1  # between two checks of state, map and recorder
 RELEASE_CHECKS = 3000  # checks after which memory that lies free is returned
 END_S = 4.5  # for everything to be written after a stop
+# The others end meanwhile on a busy computer, where the map takes long: seconds after a stop until they begin to.
+RECORDER_S, OUTPUTS_S = 2.0, 3.0
 
 
 class InternalError(StereoSfmError):
@@ -85,11 +87,14 @@ class Service(Commands):
         )
         super().__init__(config, pipelines, maps, recorder, reporter, notifier)
         self._listener = Listener("service", self._publish_line)
-        self._ended = threading.Event()
+        self._over = threading.Event()  # no more poses come
+        self._recorded = threading.Event()  # the recording is closed
+        self._ended = threading.Event()  # everything is written
         self.error: StereoSfmError | None = None  # why it ended by itself
         self._failure = ""  # of the last check that failed
         self._threads = [
             threading.Thread(target=self._run_pipelines, name="pipelines", daemon=True),
+            threading.Thread(target=self._close_recorder, name="end of the recorder", daemon=True),
             threading.Thread(target=self._keep_checking, name="state", daemon=True),
         ]
 
@@ -110,7 +115,6 @@ class Service(Commands):
         self.stop("the service is being stopped")
         for thread in self._threads:
             thread.join()
-        self._hub.close()
         self._listener.__exit__(None, None, None)
 
     def stop(self, why: str = "asked to stop") -> None:
@@ -144,18 +148,26 @@ class Service(Commands):
             self.error = InternalError(f"the service failed:\n{traceback.format_exc()}")
             self.stop("an error of the service")
         finally:
-            closing = threading.Thread(target=self._recorder.close)
-            closing.start()
+            self._over.set()
             self._maps.finish(self._pipelines.stopped_s + END_S, self._pipelines.map_complete)
-            closing.join()
+            self._recorded.wait()
             self._ended.set()
+
+    def _close_recorder(self) -> None:
+        self._pipelines.stopping.wait()
+        self._over.wait(RECORDER_S)
+        try:
+            self._recorder.close()
+        finally:
+            self._recorded.set()
 
     def _keep_checking(self) -> None:
         tidy = Release(RELEASE_CHECKS)
-        while not self._ended.wait(CHECK_S):
+        while not self._ended.wait(CHECK_S) and self._pipelines.stopping_s < OUTPUTS_S:
             self._check()
             tidy.step()
         self._check()  # once more: the outputs get the final state
+        self._hub.close()
 
     def _check(self) -> None:
         """Each on its own: the state and the saved map depend on the thread that does this."""

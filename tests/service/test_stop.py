@@ -1,0 +1,61 @@
+"""What a stop waits for: on a busy computer it must not be one thing after the other."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.config import Config
+from stereo_sfm.drivers.choice import MadeSource
+from stereo_sfm.messages import MapSaved
+from stereo_sfm.pipeline.processes import END_S, IN_FLIGHT_S, SAVE_END_S, ProcessRun
+from stereo_sfm.service import service
+from stereo_sfm.service.config import MapConfig, RobotConfig
+from stereo_sfm.service.outputs import OUTPUTS, TIDY
+from stereo_sfm.service.service import Service
+from tests.service.endless import endless_wall
+
+PATIENCE_S = 60.0
+
+
+@pytest.mark.parametrize(("ready", "saved"), [(True, False), (True, True), (False, False)])
+def test_stages_with_a_backlog_are_waited_for_only_until_the_map_is_written(
+    ready: bool, saved: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nor is a mapper that still loads its code: it has no map."""
+    run, ended = ProcessRun(MadeSource.of(endless_wall), Config()), list[float]()
+    monkeypatch.setattr(run, "_end_now", lambda: ended.append(waited_s))
+    run._not_ready = set() if ready else {"mapper"}  # pyright: ignore[reportPrivateUsage]
+    run.save_map(tmp_path, urgent=True)
+    if saved:
+        run._dispatch(MapSaved(str(tmp_path), 1))  # pyright: ignore[reportPrivateUsage]
+    for tenth in range(60):
+        waited_s = tenth / 10
+        run._progress_s = time.monotonic() - END_S - 1  # pyright: ignore[reportPrivateUsage]
+        run._enforce_end(waited_s, time.monotonic(), [])  # pyright: ignore[reportPrivateUsage]
+    assert ended and min(ended) == pytest.approx(0.1 + (SAVE_END_S if ready and not saved else IN_FLIGHT_S), abs=0.11)
+
+
+def test_recorder_and_outputs_end_while_the_map_is_still_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(service, "RECORDER_S", 0.2)
+    monkeypatch.setattr(service, "OUTPUTS_S", 0.4)
+    recorder, outputs, waited = threading.Event(), threading.Event(), list[bool]()
+    config = RobotConfig(map=MapConfig(str(tmp_path / "store")))
+    with Service(config, MadeSource.of(endless_wall), outputs={}) as running:
+        monkeypatch.setattr(running._recorder, "close", recorder.set)  # pyright: ignore[reportPrivateUsage]
+        monkeypatch.setattr(running._hub, "close", outputs.set)  # pyright: ignore[reportPrivateUsage]
+
+        def finish(*_: object) -> None:
+            waited.append(recorder.wait(PATIENCE_S) and outputs.wait(PATIENCE_S))
+
+        monkeypatch.setattr(running._maps, "finish", finish)  # pyright: ignore[reportPrivateUsage]
+    assert waited == [True]
+
+
+def test_outputs_that_tidy_up_at_their_exit_are_outputs() -> None:
+    assert OUTPUTS.keys() >= TIDY
