@@ -62,7 +62,10 @@ def main(args: list[str] | None = None) -> int:
             fine = seconds <= STOP_S and code == 0 and keyframes > 0
             good += fine
             last = (target.said.strip().splitlines()[-1:] or [""])[0][:100]
-            print(f"  {seconds:5.2f} s, exit code {code}, {keyframes} keyframes  {last if fine else target.said}", flush=True)
+            print(
+                f"  {seconds:5.2f} s, exit code {code}, {keyframes} keyframes  {last if fine else target.said}",
+                flush=True,
+            )
     print(f"load {os.getloadavg()[0]:.1f}; {good} of {o.count} within {STOP_S:g} s with a map, "
           f"median {statistics.median(took):.2f} s, the longest {max(took):.2f} s")  # fmt: skip
     return o.count - good

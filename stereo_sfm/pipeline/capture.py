@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
@@ -33,12 +34,14 @@ class SourceInfo:
     frame_count: int | None
     live: bool
     given_rig: Rig  # before a start check corrected it
+    modules: tuple[str, ...] = ()  # that were loaded to open it
 
     @staticmethod
-    def of(source: Source) -> SourceInfo:
-        """Of an open source."""
+    def of(source: Source, before: Set[str] | None = None) -> SourceInfo:
+        """Of an open source. Args: before, modules that were loaded before it was opened."""
         given = getattr(source, "given_rig", source.rig)
-        return SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live, given)
+        modules = tuple(name for name in list(sys.modules) if before is not None and name not in before)
+        return SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live, given, modules)
 
 
 @dataclass(frozen=True)

@@ -53,10 +53,11 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class WarmUp:
-    """A request before the set-up: load the code for images of such a rig."""
+    """A request before the set-up: load the code for images of such a rig, and what opening its source takes."""
 
     config: Config
     rig: Rig
+    modules: tuple[str, ...] = ()  # of the source
 
 
 class Report(Outbox):

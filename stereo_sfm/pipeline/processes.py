@@ -557,7 +557,7 @@ class ProcessRun:
     def _close(self) -> None:
         """End every process; also an interruption leaves nothing in shared memory."""
         try:
-            self._stages.close(self._ended)
+            self._stages.close(self._ended, wait=not self._abandoned)
         finally:
             self._outer.close()
             for connection in (self._woken, self._wake):

@@ -22,6 +22,7 @@ from stereo_sfm.pipeline.threads import thread_environment
 EXIT_S = 1.0  # time for the processes to exit after their last messages
 ATTEMPTS, ATTEMPT_S = 5, 0.2  # to start a stage: a fork server that was killed takes a moment to be gone
 MIN_OPEN_FILES = 128  # per process
+OWNERS = "capture", "mapper"  # of a device, of a folder: another process may take it only when they are gone
 ANY_NUMBER = 0  # of requests that wait: main never waits for a stage that does not read them
 
 
@@ -141,8 +142,12 @@ class StageProcesses:
             if stage not in but and process.is_alive():
                 process.kill()
 
-    def close(self, ended: Set[str]) -> None:
-        """End every process and close the pipes. Args: ended, stages that are about to exit by themselves."""
+    def close(self, ended: Set[str], wait: bool = True) -> None:
+        """End every process and close the pipes.
+
+        Args: ended, stages that are about to exit by themselves. wait: until all are gone, else only for `OWNERS`: on a
+        busy computer the system takes a second to free the memory of those of low priority.
+        """
         resume_helpers()  # which tell of the end of each
         try:
             until = time.monotonic() + EXIT_S
@@ -150,7 +155,9 @@ class StageProcesses:
                 self.processes[stage].join(max(until - time.monotonic(), 0.0))
             self.kill()
             until = time.monotonic() + EXIT_S
-            for process in self.processes.values():
+            for stage, process in self.processes.items():
+                if not wait and stage not in OWNERS:
+                    continue
                 process.join(max(until - time.monotonic(), 0.0))
         finally:
             for end in (*self.reports, *self._controls.values()):

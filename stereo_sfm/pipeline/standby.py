@@ -1,6 +1,7 @@
 """Stages that are started before they are needed: a service that loses its pipeline has poses again sooner.
 
-Each waits for its set-up, capture for the source that it opens; the tracker has loaded its code.
+Each waits for its set-up, capture for the source that it opens. Both have loaded their code; the tracker has what it
+computes of the calibration.
 """
 
 from __future__ import annotations
@@ -15,11 +16,15 @@ from stereo_sfm.pipeline.stage_processes import StageProcesses
 class Standby:
     """The processes of a run that has not begun."""
 
-    def __init__(self, config: Config, rig: Rig) -> None:
-        """Start them. Args: config, rig: of the run that goes on meanwhile, and probably of the next one."""
+    def __init__(self, config: Config, rig: Rig, modules: tuple[str, ...] = ()) -> None:
+        """Start them.
+
+        Args: config, rig, modules: of the run that goes on meanwhile (`SourceInfo`), and probably of the next one.
+        """
         self.stages = StageProcesses(config.pipeline.threads)
         self.outer = start_stages(self.stages, None, None, None)
-        self.stages.request("tracker", WarmUp(config, rig))
+        for stage in ("tracker", "capture"):
+            self.stages.request(stage, WarmUp(config, rig, modules))
 
     @property
     def alive(self) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import pickle
+import sys
 import time
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import make_mapper, save_result
@@ -16,6 +19,10 @@ from stereo_sfm.pipeline.child import Report, Setup, WarmUp, prepare, ready
 from stereo_sfm.pipeline.loop_link import Known
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
+
+if TYPE_CHECKING:
+    from stereo_sfm.timing import Spans
+    from stereo_sfm.tracking.protocol import AnyTracker
 
 RELEASE_KEYFRAMES = 20  # after which the loop closer returns what is free between its blocks, in 1.4 ms
 RELEASE_IMAGES = 6000  # after which the tracker does
@@ -32,9 +39,10 @@ def run_capture(
     from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 
-    opener = Inbox[Opener](control).take() if opener is None else opener
+    opener = _opener(control) if opener is None else opener
+    before = set(sys.modules)
     with opener() as source:
-        to_main.send(SourceInfo.of(source))
+        to_main.send(SourceInfo.of(source, before))
         jpeg: bool
         setup, jpeg = Inbox[tuple[Setup, bool]](control).take()
         delay = prepare("capture", setup)
@@ -58,21 +66,37 @@ def run_capture(
         ring.close()
 
 
+def _opener(control: Connection) -> Opener:
+    """Of the source, and its code before it comes."""
+    inbox = Inbox[Opener | WarmUp](control)
+    while isinstance(message := inbox.take(), WarmUp):
+        for name in message.modules:
+            with contextlib.suppress(ImportError):
+                importlib.import_module(name)
+    return message
+
+
 def _schedule(setup: Setup) -> Schedule:
     if setup.applied is not None:
         return Recorded(setup.applied)
     return Realtime() if setup.realtime else Lockstep(setup.config.pipeline.update_lag_frames)
 
 
-def _warmed_up(control: Inbox[Setup | WarmUp]) -> tuple[Setup, bool]:
-    """The set-up of the tracker, and whether its code was loaded before it came."""
-    warm = False
+def _warmed_up(control: Inbox[Setup | WarmUp], spans: Spans) -> tuple[Setup, bool, AnyTracker | None]:
+    """The set-up of the tracker, whether its code was loaded before it came, and the tracker where that was made."""
+    from stereo_sfm.pipeline.stages import make_tracker_with_places
+
+    expected: tuple[bytes, AnyTracker] | None = None
     while isinstance(message := control.take(), WarmUp):
         from stereo_sfm.pipeline.warm_up import warm_up_stage
 
         warm_up_stage("tracker", message.config, message.rig)
-        warm = True
-    return message, warm
+        made = make_tracker_with_places(message.config, message.rig, spans)
+        expected = pickle.dumps((message.config, message.rig)), made
+    if expected is None:
+        return message, False, None
+    same = message.ground_truth is None and pickle.dumps((message.config, message.rig)) == expected[0]
+    return message, True, expected[1] if same else None
 
 
 def _next_image(inbox: Inbox[Any]) -> Any:
@@ -98,12 +122,13 @@ def run_tracker(
     from stereo_sfm.pipeline.stages import TrackStage, make_tracker_with_places
     from stereo_sfm.timing import Spans
 
-    setup, warm = _warmed_up(Inbox[Setup | WarmUp](control))
-    delay = prepare("tracker", setup)
     spans = Spans()
+    setup, warm, made = _warmed_up(Inbox[Setup | WarmUp](control), spans)
+    delay = prepare("tracker", setup)
     ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
-    tracker = make_tracker_with_places(setup.config, setup.rig, spans, setup.ground_truth)
-    stage = TrackStage(tracker, _schedule(setup), PrefetchingInbox[MapUpdate](updates))
+    if made is None:
+        made = make_tracker_with_places(setup.config, setup.rig, spans, setup.ground_truth)
+    stage = TrackStage(made, _schedule(setup), PrefetchingInbox[MapUpdate](updates))
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), Outbox(to_mapper)
     ready("tracker", setup, to_main, warm=warm)

@@ -134,6 +134,7 @@ class MapKeeper:
         try:
             self._finish(until_s, complete)
         finally:
+            self._store.cancel()  # its process would wait for another request, and the service for its end
             self._store.release()
 
     def _finish(self, until_s: float, complete: bool) -> None:

@@ -81,7 +81,7 @@ class Pipelines:
                 self._standby, self._standby_after_s = None, time.monotonic() + LONGEST_PAUSE_S
             due = self._standby is None and time.monotonic() >= self._standby_after_s
             if session is not None and stable and due and not self._over:
-                self._standby = Standby(self._config, session.rig)
+                self._standby = Standby(self._config, session.source.rig, session.source.modules)
 
     def _take_standby(self) -> Standby | None:
         """What waits for the next pipeline, if all of it does."""

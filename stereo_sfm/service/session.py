@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.calib.camera_store import CorrectionKeeper
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogLine, MapSaved
+from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.standby import Standby
@@ -138,9 +138,9 @@ class Session:
         self._run.save_map(folder, urgent)
 
     @property
-    def rig(self) -> Rig:
-        """Of its source, once it has frames."""
-        return self._run.info.rig
+    def source(self) -> SourceInfo:
+        """Its source, once it has frames."""
+        return self._run.info
 
     def relocalize(self) -> None:
         """Search the whole saved map with the next keyframe."""

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import sys
 import time
+from dataclasses import replace
 
 import psutil
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import MadeSource
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.pipeline import workers
+from stereo_sfm.pipeline.capture import SourceInfo
+from stereo_sfm.pipeline.channels import Inbox
+from stereo_sfm.pipeline.child import Setup, WarmUp
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.standby import Standby
+from stereo_sfm.timing import Spans
 from tests.pipeline.test_pipeline import SlidingWall
 
 
@@ -22,6 +31,27 @@ def test_a_run_uses_the_processes_that_wait() -> None:
         assert run.pids == pids
         assert [frame.frame_id for frame in run] == list(range(12))
     assert not any(psutil.pid_exists(pid) for pid in pids.values())
+
+
+def test_the_tracker_of_a_standby_is_made_before_its_set_up_comes() -> None:
+    rig = SlidingWall(1).rig
+    info, other = SourceInfo.of(SlidingWall(1)), replace(rig, serial="another")
+    for now, used in ((info.rig, True), (other, False)):
+        receive, send = multiprocessing.Pipe(duplex=False)
+        send.send(WarmUp(Config(), rig))
+        send.send(Setup(now, Config(), None, "", "", None, True, MapFolders(), None))
+        setup, warm, made = workers._warmed_up(Inbox(receive), Spans())  # pyright: ignore[reportPrivateUsage]
+        assert warm and (made is not None) == used and setup.rig.serial == now.serial
+
+
+def test_a_standby_loads_what_opening_the_source_takes() -> None:
+    assert SourceInfo.of(SlidingWall(1), sys.modules.keys() - {"json"}).modules == ("json",)
+    receive, send = multiprocessing.Pipe(duplex=False)
+    send.send(WarmUp(Config(), SlidingWall(1).rig, ("no_such_module", "colorsys")))
+    send.send("the opener")
+    sys.modules.pop("colorsys", None)
+    assert workers._opener(receive) == "the opener"  # pyright: ignore[reportPrivateUsage]
+    assert "colorsys" in sys.modules
 
 
 def test_a_standby_that_died_is_known_and_ends() -> None:
