@@ -18,7 +18,7 @@ class Standby:
     def __init__(self, config: Config, rig: Rig) -> None:
         """Start them. Args: config, rig: of the run that goes on meanwhile, and probably of the next one."""
         self.stages = StageProcesses(config.pipeline.threads)
-        self.outer = start_stages(self.stages, None, None, None)
+        self.outer = start_stages(self.stages, None, None, None, config.dense.live)
         self.stages.request("tracker", WarmUp(config, rig))
 
     @property
