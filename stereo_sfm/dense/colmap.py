@@ -87,8 +87,9 @@ def surface_normals(points: F64) -> F32:
     across = np.cross(along, down)
     with np.errstate(invalid="ignore", divide="ignore"):
         across /= np.linalg.norm(across, axis=-1, keepdims=True)
-    away = (across * points[1:-1, 1:-1]).sum(-1, keepdims=True) > 0
-    normals[1:-1, 1:-1] = np.where(away, -across, across)
+    toward = (across * points[1:-1, 1:-1]).sum(-1, keepdims=True)
+    across[np.isnan(toward[..., 0])] = np.nan  # the middle itself is unknown
+    normals[1:-1, 1:-1] = np.where(toward > 0, -across, across)
     return normals
 
 
