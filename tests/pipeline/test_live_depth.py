@@ -24,7 +24,7 @@ from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.types import LiveDepth
 from tests.pipeline.test_pipeline import SlidingWall, inline_log, same
 
-LIVE = load(None, ["tracker.max_features=150", "pipeline.update_lag_frames=4", "dense.live=true", "dense.rate_hz=6"])
+LIVE = load(None, ["tracker.max_features=150", "pipeline.update_lag_frames=4", "dense.live=true", "dense.rate_hz=6.1"])
 
 
 class Kept:
