@@ -63,7 +63,7 @@ class FreeSlots:
         if depth is not None:
             self._holds[depth] = set()
         self._tracker, self._log, self._depth = tracker, log, depth
-        self._depth_idle = True
+        self._depth_idle = False  # it says so when it has loaded its code
         self._free = deque(range(count))
         self._log_share = max(count - TRACKER_SLOTS, 1)
 
@@ -89,9 +89,10 @@ class FreeSlots:
 
     def lend(self, slot: int, busy: bool) -> bool:
         """Whether live depth gets the slot that was taken last. Args: busy, also while it computes (files)."""
-        if self._depth not in self._holds or not (self._depth_idle or busy):
+        depth = self._depth
+        if depth is None or depth not in self._holds or not (self._depth_idle or busy):
             return False
-        self._holds[self._depth].add(slot)
+        self._holds[depth].add(slot)
         self._depth_idle = False
         return True
 

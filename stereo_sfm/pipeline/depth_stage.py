@@ -11,7 +11,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import StageTimes
-from stereo_sfm.pipeline.channels import End, Inbox, Outbox
+from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.child import Report, Setup, prepare
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
@@ -20,7 +20,7 @@ from stereo_sfm.types import StereoImage
 if TYPE_CHECKING:
     from stereo_sfm.dense.live import LiveDepthMaker
 
-IDLE = -1  # sent in place of a slot: the next image may come
+IDLE = -1  # sent in place of a slot: it is ready for an image
 
 
 class DepthSchedule(Protocol):
@@ -65,7 +65,8 @@ def run_depth(to_main: Report, control: Connection, images: Connection, release:
     inbox, free = Inbox[SlotImage | End](images), Outbox(release)
     maker = make_depth(setup.config, setup.rig)
     meter = HealthMeter("dense", to_main.send)
-    while isinstance(message := inbox.take(), SlotImage):
+    free.send(IDLE)
+    while isinstance(message := _next(inbox), SlotImage):
         to_main.pulse.begin()
         image = ring.read(message)
         free.send(message.slot)
@@ -81,3 +82,11 @@ def run_depth(to_main: Report, control: Connection, images: Connection, release:
         to_main.pulse.end()
     meter.report()
     ring.close()
+
+
+def _next(inbox: Inbox[SlotImage | End]) -> SlotImage | End:
+    """A live camera's capture process may be killed at the end: that is no fault here."""
+    try:
+        return inbox.take()
+    except Lost:
+        return End("capture")

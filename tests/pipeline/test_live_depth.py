@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from dataclasses import replace
+from multiprocessing import Pipe
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
 from stereo_sfm.pipeline import stage_graph
+from stereo_sfm.pipeline.capture import FreeSlots
 from stereo_sfm.pipeline.channels import Inbox
-from stereo_sfm.pipeline.depth_stage import make_depth
+from stereo_sfm.pipeline.depth_stage import IDLE, make_depth
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
@@ -63,6 +65,30 @@ def test_a_realtime_run_is_repeated_with_its_own_images(tmp_path: Path) -> None:
     for _ in run_inline(images, LIVE, [kept], depth_frames=chosen):
         pass
     assert {live.frame_id for live in kept.got} == chosen
+
+
+def test_only_an_idle_process_gets_a_live_image_and_a_dead_one_holds_nothing() -> None:
+    (from_tracker, tracker), (from_log, log), (from_depth, depth) = (Pipe(duplex=False) for _ in range(3))
+    slots = FreeSlots(1, from_tracker, from_log, from_depth)
+
+    def take() -> int:
+        found = slots.take(block=False)
+        assert found is not None
+        tracker.send(found[0])
+        log.send(found[0])
+        return found[0]
+
+    assert not slots.lend(take(), busy=False), "it still loads its code"
+    depth.send(IDLE)
+    assert slots.lend(take(), busy=False)
+    assert slots.take(block=False) is None, "it has not copied the image"
+    depth.send(0)
+    assert not slots.lend(take(), busy=False), "it computes"
+    depth.send(IDLE)
+    assert slots.lend(take(), busy=False)
+    depth.close()
+    assert not slots.lend(take(), busy=True)
+    from_tracker.close()
 
 
 def never(to_main: object, control: object, images: object, release: object) -> None:
