@@ -21,6 +21,10 @@ SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
 MAX_DISTORTION = 1e6  # rational models of real lenses have some hundred
 
 
+_FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # optical axes seen by the robot
+_FORWARD.flags.writeable = False
+
+
 @dataclass(frozen=True, eq=False)
 class Rig(ReadOnly):
     """One camera, or a stereo pair.
@@ -68,6 +72,14 @@ class Rig(ReadOnly):
                 f"invalid calibration: baseline of {baseline:g} m; give the extrinsics in metres "
                 "('stereo-sfm convert-calib --unit mm' converts millimetres)"
             )
+
+    @property
+    def base_T_left(self) -> F64:
+        """(4, 4) in the axes of robots (REP 103: x forward, y left, z up): the body's, or the left camera's own turned.
+
+        The second where the calibration has no body.
+        """
+        return self.body_T_left if not np.allclose(self.body_T_left, np.eye(4)) else _FORWARD
 
     @property
     def stereo(self) -> bool:

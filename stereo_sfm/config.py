@@ -357,7 +357,22 @@ class SelfCalibrationConfig:
     mode: str = word("auto", ("auto", "off", "only-report"), "Correct the rig from what is seen, or only report it")
 
 
-STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")  # processes of a run
+@dataclass(frozen=True)
+class DenseConfig:
+    """Depth images and obstacles of the newest pair, while a run goes on (dense/live.py)."""
+
+    live: bool = switch(False, "Compute depth images and obstacles in a process of their own, which delays no pose")
+    rate_hz: float = number(5.0, 0.01, 1000, "Depth images a second; a slow computer makes fewer")
+    scale: float = number(0.5, 0.05, 1, "Resolution of the depth images over that of the camera's")
+    range_m: float = number(5.0, 0.1, 1000, "Obstacles that are farther away are left out")
+    min_height_m: float = number(0.1, 0, 100, "Height above the floor below which nothing is an obstacle")
+    max_height_m: float = number(2.0, 0, 100, "Height above the floor above which nothing is an obstacle")
+    camera_height_m: float = number(
+        0.0, 0, 100, "Height of the left camera above the floor; 0: that of the calibration's body, else as seen"
+    )
+
+
+STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "dense", "logger", "viewer")  # processes of a run
 
 
 @dataclass(frozen=True)
@@ -388,6 +403,7 @@ class Config:
     mapper: MapperConfig = field(default_factory=MapperConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     self_calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
 
     def closes_loops(self, depth: bool, localize_only: bool) -> bool:

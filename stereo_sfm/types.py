@@ -155,6 +155,17 @@ class StereoImage(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class LiveDepth(Message):
+    """Depth of one pair, and what stands in a robot's way, both seen from the left camera."""
+
+    frame_id: int
+    stamp_ns: int
+    depth_mm: U16  # (H, W) along the optical axis of a pinhole camera with the axes of the left one; 0: unknown
+    pinhole: F64  # (4,) px: fx, fy, cx, cy of that camera
+    obstacles: F32 = field(metadata=shape(-1, 3))  # (N, 3) metres in the left camera
+
+
+@dataclass(frozen=True, eq=False)
 class Observations(Message):
     """Points seen in one frame, one row each."""
 

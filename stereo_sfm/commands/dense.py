@@ -23,6 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
     parser.add_argument("--voxel", type=float, default=0.02, metavar="M", help="side of a voxel (default: 0.02)")
     parser.add_argument(
+        "--slice",
+        action="append",
+        default=[],
+        metavar="LOW,HIGH",
+        help="a further costmap, of what stands between these heights in metres; again for each",
+    )
+    parser.add_argument(
         "--jobs", type=int, default=2, metavar="N", help="processes; the result is the same (default: 2)"
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
@@ -37,6 +44,7 @@ class DenseOptions:
     images: list[str]
     rig: Path | None
     voxel: float
+    slice: list[str]
     jobs: int
     quiet: bool
 
@@ -44,9 +52,10 @@ class DenseOptions:
 def run(args: argparse.Namespace) -> int:
     """Reconstruct, write the files, print what they hold."""
     options = typed(DenseOptions, args)
-    from stereo_sfm.dense.build import build
-    from stereo_sfm.dense.files import write_all
+    from stereo_sfm.dense.build import ROBOT, build
+    from stereo_sfm.dense.files import FILES, write_all
     from stereo_sfm.dense.inputs import find_input
+    from stereo_sfm.dense.report import write_report
     from stereo_sfm.errors import StereoSfmError, writing_to
     from stereo_sfm.folder_lock import FolderLock
 
@@ -54,16 +63,36 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError("--voxel must be between 0.005 and 0.2 metres")
     if options.jobs < 1:
         raise StereoSfmError("--jobs must be at least 1")
+    bands = (*ROBOT, *map(_band, options.slice))
     given = find_input(options.source, options.images, options.rig)
     with writing_to(options.output):
         options.output.mkdir(parents=True, exist_ok=True)
         with FolderLock(options.output, "choose another -o, or wait for its end"):
-            results, map_T_floor = build(given, options.output, options.voxel, options.jobs, _Bars(options.quiet))
-            numbers = write_all(results, options.output, options.voxel, map_T_floor)
+            bars = _Bars(options.quiet)
+            results, map_T_floor = build(given, options.output, options.voxel, options.jobs, bars, bands)
+            numbers = write_all(results, options.output, options.voxel, map_T_floor, bands)
+            report = write_report(options.output, str(options.source), options.voxel, numbers)
     if not options.quiet:
         print(", ".join(f"{value:.0f} {name}" for name, value in numbers.items()))
-        print(f"written to {options.output}: mesh.ply, mesh.glb, cloud.ply, costmap.png, costmap.yaml, height.png")
+        print(f"written to {options.output} (start with {report}): {FILES}")
     return 0
+
+
+def _band(text: str) -> tuple[float, float]:
+    """Heights of a slice.
+
+    Raises:
+        StereoSfmError: not two numbers, or not in order.
+    """
+    from stereo_sfm.errors import StereoSfmError
+
+    try:
+        low, high = (float(part) for part in text.split(","))
+    except ValueError:
+        low = high = 0.0
+    if not -10 <= low < high <= 100:
+        raise StereoSfmError(f"--slice takes two heights in metres, as 0.1,0.6; got '{text}'")
+    return low, high
 
 
 class _Bars:

@@ -16,10 +16,13 @@ if TYPE_CHECKING:
     from stereo_sfm.types import Trajectory
 
 
+DENSE = "colmap-dense"  # as COLMAP's fusion reads it
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("source", type=Path, metavar="RUN|MAP", help="folder of a run or of a map")
-    parser.add_argument("--format", required=True, choices=(*MAP_FORMATS, *TRAJECTORY_FORMATS))
+    parser.add_argument("--format", required=True, choices=(*MAP_FORMATS, DENSE, *TRAJECTORY_FORMATS))
     parser.add_argument("-o", "--output", type=Path, metavar="PATH", help="file or folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace what lies there")
     parser.add_argument(
@@ -28,7 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--images",
         metavar="SOURCE",
-        help="with colmap: write the keyframes' images of this source too (rectified where the map is)",
+        help="with colmap: write the keyframes' images of this source too (rectified where the map is); with "
+        f"{DENSE}: read them there instead of in the run's log or its source",
     )
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
     parser.add_argument(
@@ -62,19 +66,24 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError(f"{options.source} is not the folder of a run or a map")
     if not 0 < options.resolution < float("inf"):
         raise StereoSfmError("--resolution must be above 0 metres")
-    if options.images and options.format != "colmap":
-        raise StereoSfmError("--images goes with --format colmap")
+    if options.images and options.format not in ("colmap", DENSE):
+        raise StereoSfmError(f"--images goes with --format colmap and {DENSE}")
     if options.rig is not None and not options.images:
         raise StereoSfmError("--rig goes with --images")
     if options.session is not None and not options.images and options.format not in TRAJECTORY_FORMATS:
         raise StereoSfmError("--session goes with --images and with trajectories")
+    if options.session is not None and options.format == DENSE:
+        raise StereoSfmError(f"--session does not go with {DENSE}: give the --images of one session")
     write = _write_trajectories if options.format in TRAJECTORY_FORMATS else _write_map
+    write = _write_dense if options.format == DENSE else write
     paths = write(options, options.output or options.source / _default_name(options))
     print(f"written to {', '.join(map(str, paths))}")
     return 0
 
 
 def _default_name(options: ExportOptions) -> str:
+    if options.format == DENSE:
+        return "dense_model"
     if options.format in MAP_FORMATS:
         return MAP_FORMATS[options.format]
     ending = "csv" if options.format == "euroc" else options.format
@@ -92,6 +101,20 @@ def _write_map(options: ExportOptions, output: Path) -> list[Path]:
     else:
         export_map(saved, output, options.format, options.resolution)
     return paths
+
+
+def _write_dense(options: ExportOptions, output: Path) -> list[Path]:
+    """COLMAP's workspace with depth and normals."""
+    from stereo_sfm.commands._progress import progress
+    from stereo_sfm.dense.colmap import export_colmap_dense
+    from stereo_sfm.dense.inputs import find_input
+    from stereo_sfm.errors import writing_to
+
+    _check_free(options, [output])
+    given = find_input(options.source, [options.images] if options.images else [], options.rig)
+    with writing_to(output), progress("depth images", len(given.saved), False, "depth images") as bar:
+        export_colmap_dense(given, output, lambda *_: bar.step(""))
+    return [output]
 
 
 def _load(folder: Path) -> SavedMap:

@@ -23,17 +23,19 @@ from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
-from stereo_sfm.dense.surface import Surface, extract
+from stereo_sfm.dense.surface import LEAST_VIEWS, Surface, extract
 from stereo_sfm.dense.volume import SIDE, Seen, contributes, cubes_of, fuse, touched
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import MODELS
 from stereo_sfm.maps.floor import HIGH, LOW, find_floor
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F64, U8, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "2"  # of the files: grows when the same input gives other bits
+VERSION = "3"  # of the files: grows when the same input gives other bits
+Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
+ROBOT: Bands = ((LOW, HIGH),)
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
 Report = Callable[[str, int, int], None]  # what, done, of
 
@@ -60,18 +62,24 @@ class CubeResult:
 
     index: tuple[int, int, int]
     surface: Surface
-    occupied: Bool  # (64, 64) columns along x, y with a surface between `LOW` and `HIGH`
-    free: Bool  # (64, 64) columns seen free at some height between them
+    occupied: Bool  # (bands, 64, 64) columns along x, y with a surface in the band
+    free: Bool  # (bands, 64, 64) columns seen free at some height in the band
 
 
 def build(
-    given: DenseInput, folder: Path, voxel: float, jobs: int, report: Report = lambda *_: None
+    given: DenseInput,
+    folder: Path,
+    voxel: float,
+    jobs: int,
+    report: Report = lambda *_: None,
+    bands: Bands = ROBOT,
 ) -> tuple[list[CubeResult], F64]:
     """All cubes, ordered by their index, and map_T_floor (4, 4).
 
     Args:
         given: the map and its images. folder: for the files; may hold those of an earlier run.
         voxel: metres. jobs: processes; the bits do not depend on them. report: called after each step.
+        bands: heights of the costmaps.
     """
     map_T_floor = find_floor(given.saved.snapshot)
     for name in ("depth", "cubes"):
@@ -81,10 +89,8 @@ def build(
         if not kept:
             raise StereoSfmError("no keyframe has depth: one camera needs keyframes 10 to 40 cm apart")
         cubes = cubes_of([set(k.cubes) for k in kept])
-        tasks = [
-            (c, [k for k in kept if contributes(k.floor_T_cam[:3, 3], k.reach, c, voxel)], folder / "cubes", voxel)
-            for c in cubes
-        ]
+        seen_by = ([k for k in kept if contributes(k.floor_T_cam[:3, 3], k.reach, c, voxel)] for c in cubes)
+        tasks = [(c, views, folder / "cubes", voxel, bands) for c, views in zip(cubes, seen_by, strict=True)]
         results: list[CubeResult] = []
         for number, result in enumerate(workers.map(_cube, tasks), 1):
             results.append(result)
@@ -200,6 +206,13 @@ def _read_depth(path: Path, key: str | None) -> DepthImage | None:
     return DepthImage(camera, data["cam_R_view"], data["ranges"], data["sigmas"], data["grey"])
 
 
+def some_depths(folder: Path, count: int) -> list[DepthImage]:
+    """Depth images of a reconstruction, evenly spread over its keyframes. Args: folder, of `build`."""
+    paths = sorted((folder / "depth").glob("*.npz"))
+    found = [_read_depth(paths[(2 * k + 1) * len(paths) // (2 * count)], None) for k in range(min(count, len(paths)))]
+    return [depth for depth in found if depth is not None]
+
+
 @lru_cache(CACHED)
 def _cached_depth(path: Path, key: str) -> DepthImage:
     found = _read_depth(path, key)
@@ -216,7 +229,7 @@ def _cube_name(index: tuple[int, int, int]) -> str:
 
 
 def _cube(task: Any) -> CubeResult:
-    index, kept, folder, voxel = task
+    index, kept, folder, voxel, bands = task
     path = folder / _cube_name(index)
     key = hashlib.sha256("".join([VERSION, f"{voxel!r}", *(k.place_key() for k in kept)]).encode()).hexdigest()
     data: dict[str, Any] | None = _read(path, key)
@@ -224,19 +237,25 @@ def _cube(task: Any) -> CubeResult:
         cube = fuse(index, [Seen(_cached_depth(k.path, k.key), k.floor_T_cam, k.session) for k in kept], voxel)
         surface = extract(cube)
         own = np.s_[1 : SIDE + 1, 1 : SIDE + 1, 1 : SIDE + 1]
-        height = (index[2] * SIDE + np.arange(SIDE)) * voxel
-        band = ((height > LOW) & (height < HIGH))[None, None, :]
-        near = np.abs(cube.distance[own]) < voxel
+        seen = cube.views[own] >= LEAST_VIEWS
         columns: dict[str, Any] = {
             "cells": surface.cells, "vertices": surface.vertices, "grey": surface.grey, "quads": surface.quads,
-            "occupied": (near & (cube.views[own] >= 2) & band).any(axis=2),
-            "free": ((cube.distance[own] > voxel) & (cube.views[own] >= 2) & band).any(axis=2),
+            "occupied": np.packbits(seen & (np.abs(cube.distance[own]) < voxel)),
+            "free": np.packbits(seen & (cube.distance[own] > voxel)),
             "distance": cube.distance[own].astype(np.float16), "weight": cube.weight[own],
         }  # fmt: skip
         _write(path, key, columns)
         data = columns
     surface = Surface(data["cells"], data["vertices"], data["grey"], data["quads"])
-    return CubeResult(index, surface, data["occupied"], data["free"])
+    height = (index[2] * SIDE + np.arange(SIDE)) * voxel
+    occupied, free = (_columns(np.unpackbits(data[name]), height, bands) for name in ("occupied", "free"))
+    return CubeResult(index, surface, occupied, free)
+
+
+def _columns(voxels: U8, height: F64, bands: Bands) -> Bool:
+    """(bands, 64, 64) whether a voxel of a column is set in each band. Args: (64 ** 3,) bits, (64,) metres."""
+    cube = voxels.reshape(SIDE, SIDE, SIDE).astype(bool)
+    return np.stack([cube[:, :, (height > low) & (height < high)].any(axis=2) for low, high in bands])
 
 
 def _remove_others(folder: Path, names: set[str]) -> None:
@@ -261,9 +280,12 @@ def _write(path: Path, key: str, columns: dict[str, Any]) -> None:
 
 
 def _read(path: Path, key: str | None) -> dict[str, Any] | None:
-    """The columns of a file; None where there is none, it is damaged, or it was made of something else."""
+    """The columns of a file; None where there is none, it is damaged, or it was made of something else.
+
+    `key`: of what it should be made of; None: of anything.
+    """
     try:
         data = read_arrays(path.read_bytes())
-        return data if str(data["key"]) == key else None
+        return data if key is None or str(data["key"]) == key else None
     except (OSError, ValueError, KeyError):
         return None

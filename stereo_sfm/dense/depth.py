@@ -54,5 +54,5 @@ def pair_depth(view: PairView, left: U8, right: U8, step: int = 1) -> DepthImage
     disparity, sigma = disparities(a, b, view.disparities, step)
     disparity[~view.first.mask[::step, ::step]] = np.nan
     coarse, disparity, sigma = view.every(step), disparity / np.float32(step), sigma / np.float32(step)
-    ranges, sigmas = coarse.ranges(disparity), coarse.range_sigmas(disparity, sigma)
+    ranges, sigmas = coarse.measured(disparity, sigma)
     return DepthImage(coarse.camera, view.cam_R_view, ranges, sigmas, np.ascontiguousarray(a[::step, ::step]))

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from stereo_sfm.dense.build import CubeResult
+from stereo_sfm.dense.build import ROBOT, Bands, CubeResult
+from stereo_sfm.dense.pictures import write_mesh_pictures
 from stereo_sfm.dense.surface import joined
 from stereo_sfm.dense.volume import SIDE
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, write_floor_plan
@@ -17,9 +18,20 @@ from stereo_sfm.export.ply import write_ply
 from stereo_sfm.maps.floor import HIGH
 from stereo_sfm.types import F32, F64, I64, U8
 
+LAS_HEADER, LAS_STEP = 227, 0.001  # bytes; metres
+LAS_POINT = np.dtype([
+    ("xyz", "<i4", 3), ("intensity", "<u2"), ("returns", "u1"), ("class", "u1"), ("angle", "i1"), ("user", "u1"),
+    ("source", "<u2"), ("colour", "<u2", 3),
+])  # fmt: skip
+FILES = (
+    "mesh.ply, mesh.glb, cloud.ply, cloud.las, costmap.png, costmap.yaml, height.png, mesh_height.png, mesh_grey.png"
+)
 
-def write_all(results: list[CubeResult], folder: Path, voxel: float, map_T_floor: F64) -> dict[str, float]:
-    """Write mesh.ply, mesh.glb, cloud.ply, costmap.png and costmap.yaml, height.png; returns numbers about them.
+
+def write_all(
+    results: list[CubeResult], folder: Path, voxel: float, map_T_floor: F64, bands: Bands = ROBOT
+) -> dict[str, float]:
+    """Write `FILES`, and a costmap for each further band of heights; returns numbers about them.
 
     All are in the floor's frame of `costmap.yaml` (`map_T_floor`): metres, z up, z = 0 on the floor.
     """
@@ -29,8 +41,11 @@ def write_all(results: list[CubeResult], folder: Path, voxel: float, map_T_floor
     write_mesh_ply(folder / "mesh.ply", points, colours, triangles)
     write_glb(folder / "mesh.glb", points, colours, triangles)
     write_ply(folder / "cloud.ply", points, colours)
-    plan = costmap(results, voxel, map_T_floor)
-    write_floor_plan(plan, folder / "costmap")
+    write_las(folder / "cloud.las", points, colours)
+    for number, (low, high) in enumerate(bands):
+        name = "costmap" if number == 0 else f"costmap_{low:.2f}_{high:.2f}"
+        write_floor_plan(costmap(results, voxel, map_T_floor, number), folder / name)
+    write_mesh_pictures(folder, points, grey, triangles)
     write_heights(folder / "height.png", points, voxel)
     area = 0.0
     if len(triangles):
@@ -87,16 +102,32 @@ def write_glb(path: Path, points: F64, colours: U8, triangles: I64) -> None:
     )
 
 
-def costmap(results: list[CubeResult], voxel: float, map_T_floor: F64) -> FloorPlan:
-    """Where a robot meets something between the floor and its height, one pixel a voxel."""
+def write_las(path: Path, points: F64, colours: U8) -> None:
+    """LAS 1.2, point format 2 (ASPRS specification of 2008): millimetres as integers, 16 bits a colour."""
+    rows = np.zeros(len(points), LAS_POINT)
+    low, high = (points.min(0), points.max(0)) if len(points) else (np.zeros(3), np.zeros(3))
+    rows["xyz"] = np.rint((points - low) / LAS_STEP)
+    rows["returns"] = 1 | 1 << 3  # the first of one
+    rows["colour"] = colours.astype(np.uint16) * 257
+    bounds = np.stack([high, low], axis=1).ravel().tolist()  # largest and least x, then y, then z
+    header = struct.pack(
+        "<4sHHIHH8sBB32s32sHHHIIBHI5I3d3d6d",
+        b"LASF", 0, 0, 0, 0, 0, b"", 1, 2, b"stereo-sfm", b"stereo-sfm", 0, 0, LAS_HEADER, LAS_HEADER, 0, 2,
+        rows.itemsize, len(rows), len(rows), 0, 0, 0, 0, *[LAS_STEP] * 3, *low.tolist(), *bounds,
+    )  # fmt: skip
+    path.write_bytes(header + rows.tobytes())
+
+
+def costmap(results: list[CubeResult], voxel: float, map_T_floor: F64, band: int = 0) -> FloorPlan:
+    """Where a robot meets something in a band of heights, one pixel a voxel."""
     columns = np.array([r.index[:2] for r in results])
     low, high = columns.min(axis=0), columns.max(axis=0) + 1
     shape = ((high - low) * SIDE).tolist()
     occupied, free = np.zeros(shape, bool), np.zeros(shape, bool)
     for r in results:
         x, y = ((np.array(r.index[:2]) - low) * SIDE).tolist()
-        occupied[x : x + SIDE, y : y + SIDE] |= r.occupied
-        free[x : x + SIDE, y : y + SIDE] |= r.free
+        occupied[x : x + SIDE, y : y + SIDE] |= r.occupied[band]
+        free[x : x + SIDE, y : y + SIDE] |= r.free[band]
     image = np.full(shape, UNKNOWN, np.uint8)
     image[free] = FREE
     image[occupied] = OCCUPIED

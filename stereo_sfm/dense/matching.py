@@ -28,17 +28,25 @@ def match_both_ways(left: U8, right: U8, disparities: int) -> tuple[F32, F32]:
     return agreeing(a, b, AGREE_PX), _mirrored(agreeing(flipped_b, flipped_a, AGREE_PX))
 
 
+def match_checked(left: U8, right: U8, disparities: int) -> F32:
+    """(H, W) px disparities of left pixels from one matching, which OpenCV itself checks against the right image."""
+    return _match(left, right, disparities, round(AGREE_PX))
+
+
 def _mirrored(image: Any) -> Any:
     return np.ascontiguousarray(image[:, ::-1])
 
 
-def _match(left: U8, right: U8, disparities: int) -> F32:
-    """Padded by the search range, so that pixels at the left border have a disparity as well."""
+def _match(left: U8, right: U8, disparities: int, agree: int = -1) -> F32:
+    """Padded by the search range, so that pixels at the left border have a disparity as well.
+
+    `agree`: px by which the right image's disparity may differ; -1: any.
+    """
     import cv2
 
     area = BLOCK * BLOCK
     matcher = cv2.StereoSGBM.create(
-        0, disparities, BLOCK, SMALL_STEP * area, LARGE_STEP * area, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY
+        0, disparities, BLOCK, SMALL_STEP * area, LARGE_STEP * area, agree, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY
     )
     padded = [cv2.copyMakeBorder(i, 0, 0, disparities, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
     found = np.asarray(matcher.compute(padded[0], padded[1]))[:, disparities:].astype(np.float32) / 16

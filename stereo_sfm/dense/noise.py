@@ -21,12 +21,13 @@ ONE_SIGMA = 0.6827  # share within one standard deviation
 UNLEARNED = 2.0  # over the predicted noise, where nothing can be learned
 
 
-def learned_sigmas(disparity: F32, predicted: F32, step: int = 1) -> F32:
+def learned_sigmas(disparity: F32, predicted: F32, step: int = 1, sparse: int = 1) -> F32:
     """(H, W) px standard deviations of disparities (H, W), from those (H, W) that grey-level noise predicts.
 
-    `step`: px of the image between two of these disparities.
+    `step`: px of the image between two of these disparities. `sparse`: learn from every such row and column alone.
     """
-    apart, noise = _second_differences(disparity, predicted, -(-APART // step))
+    some = np.s_[::sparse, ::sparse]
+    apart, noise = _second_differences(disparity[some], predicted[some], -(-APART // (step * sparse)))
     if len(apart) < BINS * FEW:
         return (UNLEARNED * predicted).astype(np.float32)
     order = np.argsort(noise, kind="stable")

@@ -68,13 +68,14 @@ class PairView:
         """Both (H, W) images in the view."""
         return self.first.apply(first), self.second.apply(second)
 
+    def measured(self, disparity: F32, sigma: F32) -> tuple[F32, F32]:
+        """As `ranges`, and standard deviations in metres from those (H, W) px of the disparities."""
+        ranges, slope = self._geometry(disparity)
+        return ranges, slope * sigma
+
     def ranges(self, disparity: F32) -> F32:
         """Disparities (H, W) px -> metres from the first camera's centre along each pixel's ray."""
         return self._geometry(disparity)[0]
-
-    def range_sigmas(self, disparity: F32, sigma: F32) -> F32:
-        """Standard deviations (H, W) in metres of ranges whose disparities have standard deviations (H, W) px."""
-        return self._geometry(disparity)[1] * sigma
 
     def _geometry(self, disparity: F32) -> tuple[F32, F32]:
         """Range, and the size of its derivative by the disparity."""

@@ -18,12 +18,14 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.types import F32, F64, I64
+from stereo_sfm.geometry.cameras import Camera, Pinhole
+from stereo_sfm.types import F32, F64, I64, LiveDepth
 
+OBSTACLE_COLOR = (255, 90, 60, 255)
 FEW = 8  # poses that are converted one by one in less time than together
 LEVELS = {"DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "CRITICAL": 5}
 
@@ -107,6 +109,20 @@ def calibration(camera: Camera, frame: str, stamp_ns: int, projection_tx: float 
     out.R.extend(np.eye(3).ravel())
     out.P.extend(np.column_stack([k, [projection_tx, 0.0, 0.0]]).ravel())
     return stamp(out, stamp_ns)
+
+
+def live_depth(live: LiveDepth) -> tuple[RawImage, CameraCalibration, PointCloud]:
+    """The depth image, its camera, and the obstacles, all in the left camera's frame."""
+    height, width = live.depth_mm.shape
+    pixels = live.depth_mm.astype("<u2").tobytes()
+    image = RawImage(frame_id="cam0", width=width, height=height, encoding="16UC1", step=2 * width, data=pixels)
+    camera = calibration(Pinhole(width, height, *live.pinhole.tolist()), "cam0", live.stamp_ns)
+    ids = np.arange(len(live.obstacles))
+    return (
+        stamp(image, live.stamp_ns),
+        camera,
+        point_cloud("cam0", live.stamp_ns, live.obstacles.astype(float), ids, OBSTACLE_COLOR),
+    )
 
 
 def point_cloud(

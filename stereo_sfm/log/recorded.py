@@ -71,6 +71,7 @@ class RecordedRun:
     config: Config
     applied: list[Applied]
     dropped: list[Dropped]
+    depth_frames: frozenset[int] = frozenset()  # images with a live depth
     opening: Opening = field(default_factory=Opening)  # of the source
     start_check: StartCheck | None = None  # that the run began with
 
@@ -97,6 +98,7 @@ def read_run(reader: LogReader) -> RecordedRun:
         config,
         found[topics.APPLIED],
         found[topics.DROPPED],
+        frozenset(record.sequence for record in reader.messages((topics.LIVE_DEPTH,))),
         read_opening(reader),
         next(iter(found[topics.START_CHECK]), None),
     )

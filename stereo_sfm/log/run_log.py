@@ -28,6 +28,7 @@ from stereo_sfm.types import (
     I32,
     Frame,
     Keyframe,
+    LiveDepth,
     LoopResult,
     MapUpdate,
     StereoImage,
@@ -210,6 +211,15 @@ class RunLog:
         self._release_waiting()
         self._results[result.kf_id] = result
         self._release_updates()
+
+    @_write.register
+    def depth(self, live: LiveDepth) -> None:
+        """Depth of a pair while the run goes on."""
+        stamp, sequence = live.stamp_ns, live.frame_id
+        image, camera, cloud = foxglove.live_depth(live)
+        self._writer.write(topics.LIVE_DEPTH, image, stamp, sequence)
+        self._writer.write(topics.LIVE_CALIBRATION, camera, stamp, sequence)
+        self._writer.write(topics.OBSTACLES, cloud, stamp, sequence)
 
     @_write.register
     def counters(self, counters: SourceCounters) -> None:

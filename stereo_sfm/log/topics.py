@@ -36,6 +36,9 @@ THUMBNAIL = "/cam0/thumbnail"
 DEPTH_IMAGE = "/depth/image"
 LEFT_CALIBRATION = "/cam0/calibration"
 RIGHT_CALIBRATION = "/cam1/calibration"
+LIVE_DEPTH = "/depth"
+LIVE_CALIBRATION = "/depth/calibration"
+OBSTACLES = "/obstacles"
 IMAGE_INFO = ImageInfo.TOPIC.name
 IMU = ImuSample.TOPIC.name
 WHEEL = WheelSample.TOPIC.name
@@ -111,6 +114,9 @@ TABLE: tuple[Row, ...] = (
     _foxglove(RIGHT_IMAGE, _IMAGE, "every image of a stereo source"),
     _foxglove(THUMBNAIL, "CompressedImage", "every few seconds of a recording: the left image, small"),
     _foxglove(DEPTH_IMAGE, "RawImage", "every image of an RGB-D source, metres"),
+    _foxglove(LIVE_DEPTH, "RawImage", "with dense.live: depth of a pair in millimetres, several times a second"),
+    _foxglove(LIVE_CALIBRATION, "CameraCalibration", "with each of those: its pinhole camera"),
+    _foxglove(OBSTACLES, "PointCloud", "with each of those: what stands in a robot's way, seen from the left camera"),
     _foxglove(LEFT_CALIBRATION, "CameraCalibration", "at the start and every second"),
     _foxglove(RIGHT_CALIBRATION, "CameraCalibration", "at the start and every second"),
     _ours(ImuSample),

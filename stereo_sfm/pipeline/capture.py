@@ -17,6 +17,7 @@ from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.drivers.start_checked import RigChanged
 from stereo_sfm.pipeline.channels import End, Outbox, pickled
+from stereo_sfm.pipeline.depth_stage import IDLE, DepthSchedule
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
 from stereo_sfm.pipeline.stages import sensor_drop, source_counters, start_check
@@ -55,11 +56,17 @@ TRACKER_SLOTS = 4  # of the ring, reserved from the log in real time
 
 
 class FreeSlots:
-    """The free slots of the ring: the tracker and the log (or main in its place) return each slot."""
+    """The free slots of the ring: the tracker and the log (or main in its place) return each slot.
 
-    def __init__(self, count: int, tracker: Connection, log: Connection) -> None:
+    Live depth returns those that it was lent, and says when it can take another.
+    """
+
+    def __init__(self, count: int, tracker: Connection, log: Connection, depth: Connection | None = None) -> None:
         self._holds: dict[Connection, set[int]] = {tracker: set(), log: set()}
-        self._tracker, self._log = tracker, log
+        if depth is not None:
+            self._holds[depth] = set()
+        self._tracker, self._log, self._depth = tracker, log, depth
+        self._depth_idle = False  # it says so when it has loaded its code
         self._free = deque(range(count))
         self._log_share = max(count - TRACKER_SLOTS, 1)
 
@@ -83,6 +90,15 @@ class FreeSlots:
                 self._holds[reader].add(slot)
         return slot, logged
 
+    def lend(self, slot: int, busy: bool) -> bool:
+        """Whether live depth gets the slot that was taken last. Args: busy, also while it computes (files)."""
+        depth = self._depth
+        if depth is None or depth not in self._holds or not (self._depth_idle or busy):
+            return False
+        self._holds[depth].add(slot)
+        self._depth_idle = False
+        return True
+
     def _collect(self, timeout: float | None) -> None:
         while ready := wait(list(self._holds), timeout):
             timeout = 0
@@ -93,6 +109,9 @@ class FreeSlots:
     def _take_back(self, connection: Connection) -> None:
         try:
             back: set[int] = {connection.recv()}
+            if back == {IDLE}:
+                self._depth_idle = True
+                return
             self._holds[connection] -= back
         except (EOFError, OSError):
             back = self._holds.pop(connection)  # a dead reader reads its slots no more
@@ -126,6 +145,8 @@ class CaptureStage:
     stop: StopFlag
     realtime: bool
     jpeg: bool
+    to_depth: Outbox | None = None
+    depth: DepthSchedule | None = None  # which images it gets
     _last: int = -1  # frame id
 
     def run(self) -> None:
@@ -138,6 +159,9 @@ class CaptureStage:
             self._count(self._last)  # also when the source failed
             self.to_tracker.send(End("capture"))  # what was read so far is processed
             self.to_tracker.close()
+            if self.to_depth is not None:
+                self.to_depth.send(End("capture"))
+                self.to_depth.close()
 
     def _read(self) -> None:
         meter = HealthMeter("capture", self.to_main.send)
@@ -156,6 +180,7 @@ class CaptureStage:
             message = pickled(self._put(*free, image, begin))
             self.to_tracker.send(message)
             self.to_main.send(message)
+            self._send_depth(image, free[0], message)
             self._last = image.frame_id
             if meter.add(self._last, (time.monotonic() - begin) * 1e3, self.to_tracker.waiting()):
                 self._count(self._last)
@@ -176,6 +201,14 @@ class CaptureStage:
             if image is None:
                 return
             yield image
+
+    def _send_depth(self, image: StereoImage, slot: int, message: bytes) -> None:
+        """Live depth gets the images that its schedule wants; a camera's images do not wait for it."""
+        if self.to_depth is None or self.depth is None or not self.depth.due(image):
+            return
+        if self.slots.lend(slot, busy=not self.realtime):
+            self.depth.taken(image)
+            self.to_depth.send(message)
 
     def _count(self, frame_id: int) -> None:
         """Send the source's counters."""

@@ -27,7 +27,7 @@ from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.types import Applied, Trajectory
 
 # Beside a live camera the pose comes first: what the others take must not delay it, if all share one core.
-NICENESS = {"logger": 2, "mapper": 4, "loop": 6, "optimizer": 8}
+NICENESS = {"logger": 2, "mapper": 4, "loop": 6, "optimizer": 8, "dense": 10}
 LOWEST_PRIORITY = 19
 AT_CAMERA_RATE = "capture", "tracker"  # their arrays are of the same sizes with every image
 HELPER = "loop"  # compiles a part of what the tracker needs in a first run, before its own kernels
@@ -48,6 +48,7 @@ class Setup:
     folders: MapFolders
     delays: int | None  # seed of random delays in every stage (tests)
     opening: Opening = field(default_factory=Opening)  # of the source
+    depth_frames: frozenset[int] | None = None  # of a recorded run: which images get a live depth
     pose_first: bool = False  # the first pose waits for the code of the first image only
 
 

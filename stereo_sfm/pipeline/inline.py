@@ -13,6 +13,7 @@ from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
 from stereo_sfm.messages import LogLine, Sink, StageTimes
+from stereo_sfm.pipeline.depth_stage import depth_schedule, make_depth
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
 from stereo_sfm.pipeline.stages import (
     LocalMailbox,
@@ -43,6 +44,7 @@ class InlineRun:
         schedule: Schedule | None = None,
         folders: MapFolders | None = None,
         jpeg: bool = False,
+        depth_frames: frozenset[int] | None = None,
     ) -> None:
         self._config, self._rig, self._folders = config, source.rig, folders or MapFolders()
         self._lines: deque[LogLine] = deque()
@@ -55,6 +57,8 @@ class InlineRun:
         schedule = schedule or Lockstep(config.pipeline.update_lag_frames)
         self._track = TrackStage(tracker, schedule, self._updates)
         self._closer = make_closer(config, source.rig, self._spans, self._folders.localize_only)
+        self._depth = make_depth(config, source.rig)
+        self._depth_schedule = depth_schedule(config, source.rig, depth_frames)
         lag = config.pipeline.loop_lag_keyframes
         self.map_stage = MapStage(
             make_mapper(config, source.rig, self._spans, self._folders),
@@ -86,8 +90,18 @@ class InlineRun:
         assert frame is not None
         if keyframe is not None:
             self._map(keyframe)
+        self._make_depth(image)
         self.publish(StageTimes(frame.frame_id, self._spans.take()))
         return frame
+
+    def _make_depth(self, image: StereoImage) -> None:
+        if self._depth is None or self._depth_schedule is None or not self._depth_schedule.due(image):
+            return
+        self._depth_schedule.taken(image)
+        with self._spans.span("depth"):
+            found = self._depth.step(image)
+        if found is not None:
+            self.publish(found)
 
     def _map(self, keyframe: Keyframe) -> None:
         if self._closer is not None:
@@ -132,6 +146,7 @@ def run_inline(
     schedule: Schedule | None = None,
     folders: MapFolders | None = None,
     jpeg: bool = False,
+    depth_frames: frozenset[int] | None = None,
 ) -> Generator[Frame, None, None]:
     """Take every image of an open source through all stages and yield its frame.
 
@@ -141,8 +156,9 @@ def run_inline(
         schedule: when updates reach the tracker; lockstep when omitted.
         folders: maps to load and to save.
         jpeg: the sinks store images as JPEG, so the tracker gets the decoded pixels.
+        depth_frames: the images with a live depth of a run that is repeated; None: by the configured rate.
     """
-    run = InlineRun(source, config, sinks, schedule, folders, jpeg)
+    run = InlineRun(source, config, sinks, schedule, folders, jpeg, depth_frames)
     with Listener("main", run.add_line), limited_threads(config.pipeline.threads):
         images, failure = checked_samples(ascending(source, source.name)), None
         checked = start_check(source)

@@ -37,6 +37,7 @@ from stereo_sfm.types import Applied, Frame, Keyframe, LoopResult, StereoImage
 log = logging.getLogger("stereo_sfm")
 
 SINKS = {"logger", "viewer"}
+OPTIONAL = {"viewer", "dense"}  # a run goes on without them, and never waits for them
 CHECK_S = 0.25  # between two checks for processes that do not respond
 STOP_GRACE_S = 2.0  # time for capture to react to a stop
 IN_FLIGHT_S = 1.0  # time after a stop for images in flight, where the map is written: 0.1 s on a quiet computer
@@ -62,6 +63,7 @@ class ProcessRun:
         *,
         realtime: bool | None = None,
         applied: Sequence[Applied] | None = None,
+        depth_frames: frozenset[int] | None = None,
         log: LogOptions | None = None,
         folders: MapFolders | None = None,
         viewer: ViewerOptions | None = None,
@@ -80,6 +82,7 @@ class ProcessRun:
             sinks: get every message of the run but the images, in this process.
             realtime: drop images and take updates as they come; None: by the source (`live`).
             applied: schedule of an earlier realtime run to repeat.
+            depth_frames: the images of that run with a live depth.
             log: write everything to an MCAP file.
             folders: maps to load and to save.
             viewer: show the run.
@@ -92,6 +95,7 @@ class ProcessRun:
         """
         self._opener, self._config, self._sinks = opener, config, list(sinks)
         self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
+        self._depth_frames = depth_frames
         self._folders, self._viewer = folders or MapFolders(), viewer
         self._opened, self._images, self._silent_s = opened, images, silent_s
         self._pose_first = pose_first
@@ -234,7 +238,7 @@ class ProcessRun:
             return
         self._next_check_s = now + CHECK_S
         waiting = self._stages.waiting
-        silent = self._watchdog.silent(sorted(waiting - {"viewer"}))
+        silent = self._watchdog.silent(sorted(waiting - OPTIONAL))
         if silent and self._silent_s is not None and self._stopped_s is None:
             self._abandon()
             raise StageDied(f"the {silent[0]} process does not respond")
@@ -276,7 +280,7 @@ class ProcessRun:
     def _start(self) -> None:
         standby = self._take_standby()
         if standby is None:
-            self._outer = start_stages(self._stages, self._opener, self._log, self._viewer)
+            self._outer = start_stages(self._stages, self._opener, self._log, self._viewer, self._config.dense.live)
         else:
             self._stages, self._outer = standby.stages, standby.outer
             self._stages.request("capture", self._opener)
@@ -307,6 +311,7 @@ class ProcessRun:
             folders=self._folders,
             delays=self._delays,
             opening=self._folders.opening(self._opener.opening(info.rig)),
+            depth_frames=self._depth_frames,
             pose_first=self._pose_first,
         )
         self._loop.closing = self._config.closes_loops(info.rig.stereo, self._folders.localize_only)
@@ -477,6 +482,10 @@ class ProcessRun:
         if stage == "viewer":  # closed or crashed: the run continues
             self._ended.add(stage)
             return
+        if stage == "dense":
+            log.warning("live depth ended: its process %s; the run goes on", self._stages.how_it_died(stage))
+            self._finished(stage)
+            return
         if stage == "logger" and self._live:
             self._give_up_log(f"the {stage} process {self._stages.how_it_died(stage)}")
             return
@@ -520,6 +529,11 @@ class ProcessRun:
             log.warning("the viewer stopped: %s", failed.message.strip().splitlines()[-1])
             self._stages.reports.pop(connection)
             self._ended.add("viewer")
+            return
+        if failed.stage == "dense":
+            log.warning("live depth ended: %s; the run goes on", failed.message.strip().splitlines()[-1])
+            self._stages.forget("dense")
+            self._finished("dense")
             return
         if failed.stage == "logger" and self._live and not failed.ours:
             self._stages.reports.pop(connection)

@@ -190,6 +190,11 @@ class Session:
         """Images that the run to be repeated dropped because it was too slow."""
         return [] if self._replayed is None else [d for d in self._replayed.dropped if d.where == "ring"]
 
+    @property
+    def _depth_frames(self) -> frozenset[int] | None:
+        """The images of the run to be repeated that have a live depth."""
+        return None if self._replayed is None else self._replayed.depth_frames
+
     # -- wirings -----------------------------------------------------------------------------------------------------
 
     def _enter_inline(self, stack: ExitStack) -> Iterator[Frame]:
@@ -237,7 +242,7 @@ class Session:
         for drop in self._ring_drops():
             for sink in sinks:
                 sink.put(drop)
-        frames = run_inline(source, self._config, sinks, schedule, self._folders, jpeg=jpeg)
+        frames = run_inline(source, self._config, sinks, schedule, self._folders, jpeg, self._depth_frames)
         stack.callback(frames.close)
         return frames
 
@@ -258,6 +263,7 @@ class Session:
             self._sinks,
             realtime=None if self._wiring.mode is None else self._wiring.mode == "realtime",
             applied=None if self._replayed is None else self._replayed.applied,
+            depth_frames=self._depth_frames,
             log=self._log_options(self._opener.device, self.folder),
             folders=self._folders,
             viewer=viewer,

@@ -1,12 +1,12 @@
 """Which stage is connected with which.
 
-    capture -> tracker               images by slot
+    capture -> tracker, dense        images by slot
     tracker -> mapper                keyframes
     main    -> loop                  keyframes
     main    -> mapper                loop results
     mapper  -> tracker               updates
     mapper <-> optimizer             full bundle adjustment
-    tracker, logger -> capture       slots that are free again
+    tracker, logger, dense -> capture    slots that are free again
     every stage -> main -> logger, viewer
 
 Every arrow is a pipe of its own, so a killed process leaves no lock behind, and its death is an end of file to its
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
 from stereo_sfm.drivers.choice import Opener
-from stereo_sfm.pipeline import logger, viewer, workers
+from stereo_sfm.pipeline import depth_stage, logger, viewer, workers
 from stereo_sfm.pipeline.channels import Outbox
 from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.logger_link import LoggerLink
@@ -45,7 +45,11 @@ class OuterEnds:
 
 
 def start_stages(
-    stages: StageProcesses, opener: Opener | None, log: LogOptions | None, viewer_options: ViewerOptions | None
+    stages: StageProcesses,
+    opener: Opener | None,
+    log: LogOptions | None,
+    viewer_options: ViewerOptions | None,
+    live_depth: bool = False,
 ) -> OuterEnds:
     """Start the processes of a run with the pipes between them. Args: opener, of the source; None: it is sent later."""
     pipe, spawn = stages.pipe, stages.spawn
@@ -54,7 +58,11 @@ def start_stages(
     jobs, results = pipe(), pipe()
     tracker_free, second_free = pipe(), pipe()
     logged, shown = pipe(), pipe()
-    spawn("capture", workers.run_capture, opener, images[1], (tracker_free[0], second_free[0]))
+    depth = (pipe(), pipe()) if live_depth else ()  # images to it, slots from it
+    slots = (tracker_free[0], second_free[0], *(back[0] for back in depth[1:]))
+    spawn("capture", workers.run_capture, opener, images[1], slots, depth[0][1] if depth else None)
+    if depth:
+        spawn("dense", depth_stage.run_depth, depth[0][0], depth[1][1])
     spawn("tracker", workers.run_tracker, images[0], tracker_free[1], updates[0], to_mapper[1])
     spawn("mapper", workers.run_mapper, to_mapper[0], loops[0], updates[1], jobs[1], results[0])
 
@@ -76,7 +84,7 @@ def start_stages(
         logged[1]: log is not None,
         shown[1]: viewer_options is not None,
     }
-    for ends in (images, updates, to_mapper, loops, jobs, results, tracker_free, second_free, logged, shown):
+    for ends in (images, updates, to_mapper, loops, jobs, results, tracker_free, second_free, logged, shown, *depth):
         for end in ends:
             if not kept.get(end, False):
                 end.close()  # only the stages hold these: their death must be seen as an end of file

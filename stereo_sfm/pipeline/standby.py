@@ -22,7 +22,7 @@ class Standby:
         Args: config, rig, modules: of the run that goes on meanwhile (`SourceInfo`), and probably of the next one.
         """
         self.stages = StageProcesses(config.pipeline.threads)
-        self.outer = start_stages(self.stages, None, None, None)
+        self.outer = start_stages(self.stages, None, None, None, config.dense.live)
         for stage in ("tracker", "capture"):
             self.stages.request(stage, WarmUp(config, rig, modules))
 

@@ -33,10 +33,17 @@ def run_capture(
     control: Connection,
     opener: Opener | None,
     tracker: Connection,
-    readers: tuple[Connection, Connection],
+    readers: tuple[Connection, ...],
+    depth: Connection | None,
 ) -> None:
-    """Open the source, describe it to main, read it to the end. Args: opener, of it; None: main sends it."""
+    """Open the source, describe it to main, read it to the end.
+
+    Args:
+        opener: of the source; None: main sends it.
+        readers: where slots return: from the tracker, the log, and live depth if there is one. depth: to that one.
+    """
     from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag
+    from stereo_sfm.pipeline.depth_stage import depth_schedule
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 
     opener = _opener(control) if opener is None else opener
@@ -60,6 +67,8 @@ def run_capture(
             StopFlag(control, first == "stop"),
             setup.realtime,
             jpeg,
+            None if depth is None else Outbox(depth),
+            depth_schedule(setup.config, setup.rig, setup.depth_frames),
         )
         delay()
         stage.run()

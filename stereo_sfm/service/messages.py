@@ -8,7 +8,7 @@ from typing import get_args
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.messages import Health
-from stereo_sfm.types import F32, F64, I32, I64, U8, Bool, Message, shape
+from stereo_sfm.types import F32, F64, I32, I64, U8, Bool, LiveDepth, Message, shape
 
 
 class ServiceState(enum.StrEnum):
@@ -131,5 +131,5 @@ class Event:
     text: str
 
 
-ServiceMessage = Started | Status | PoseUpdate | MapCloud | PreviewImage | HealthReport | Event
+ServiceMessage = Started | Status | PoseUpdate | MapCloud | PreviewImage | HealthReport | Event | LiveDepth
 EVERYTHING: frozenset[type[ServiceMessage]] = frozenset(get_args(ServiceMessage))  # for publishers that want all of it

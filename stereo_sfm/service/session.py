@@ -25,7 +25,7 @@ from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.states import Facts
-from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations, StartCheck
+from stereo_sfm.types import Frame, Keyframe, LiveDepth, MapUpdate, Observations, StartCheck
 
 log = logging.getLogger("stereo_sfm")
 
@@ -66,6 +66,7 @@ class Session:
             Frame: self._frame,
             Keyframe: self._keyframe,
             MapUpdate: self._update,
+            LiveDepth: hub.publish,
             Localized: self._localize,
             MapSaved: self._map_saved,
             LogLine: self._line,

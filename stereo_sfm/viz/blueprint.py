@@ -47,7 +47,10 @@ def _images() -> rrb.Horizontal:
         rrb.Spatial2DView(
             origin="/map/camera/left", name="left: tracks by age, new blue, old red", background=BACKGROUND
         ),
-        rrb.Spatial2DView(origin="/right", name="right: disparity, far blue, near red", background=BACKGROUND),
+        rrb.Tabs(
+            rrb.Spatial2DView(origin="/right", name="right: disparity, far blue, near red", background=BACKGROUND),
+            rrb.Spatial2DView(origin="/depth", name="live depth", background=BACKGROUND),
+        ),
     )
 
 

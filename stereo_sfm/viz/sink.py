@@ -22,6 +22,7 @@ from stereo_sfm.types import (
     Dropped,
     Frame,
     Keyframe,
+    LiveDepth,
     LoopResult,
     MapUpdate,
     StereoImage,
@@ -38,6 +39,7 @@ MATCHES_DRAWN = 100  # more lines would hide the image: every k-th is drawn
 MATCHES_EVERY = 5  # images between two images of matches
 KEPT = 64  # images waiting for their frame, more than the stages can hold
 GRACE_S = 5.0  # time for a viewer to take the remaining messages
+OBSTACLE = (255, 90, 60)
 TRUTH = (95, 200, 110)
 MASKED = (230, 60, 90)
 MASK_OPACITY = 0.45
@@ -239,6 +241,20 @@ class RerunSink:
         image = self._images.pop(keyframe.frame_id, None)
         if image is not None:
             self._keyframe = (keyframe, image.left)
+
+    @_show.register
+    def _put_depth(self, live: LiveDepth) -> None:
+        self._at(live.frame_id, live.stamp_ns)
+        fx, fy, cx, cy = live.pinhole.tolist()
+        height, width = live.depth_mm.shape
+        camera = rr.Pinhole(
+            focal_length=(fx, fy), principal_point=(cx + 0.5, cy + 0.5), width=width, height=height,
+            camera_xyz=rr.ViewCoordinates.RDF,
+        )  # fmt: skip
+        self._rec.log("depth", camera)
+        self._rec.log("depth/image", rr.DepthImage(live.depth_mm, meter=1000.0))
+        obstacles = rr.Points3D(live.obstacles, colors=[OBSTACLE], radii=rr.Radius.ui_points(2.0))
+        self._rec.log("map/camera/obstacles", obstacles)
 
     @_show.register
     def _put_dropped(self, dropped: Dropped) -> None:

@@ -23,6 +23,8 @@ from stereo_sfm.dense import build as module
 from stereo_sfm.dense import inputs
 from stereo_sfm.dense.files import write_all, write_heights
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
+from stereo_sfm.dense.pictures import render_mesh
+from stereo_sfm.dense.report import write_report
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from tests.dense.test_depth import render
@@ -108,6 +110,50 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     )
     assert (image[row - 2 : row + 3, column] == 0).any(), "the wall is occupied"
     assert image[row + 12, column] == 254, "the floor before it is free"
+
+
+def test_slices_las_and_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(monkeypatch)
+    bands = (*module.ROBOT, (0.2, 0.6), (5.0, 6.0))
+    results, map_T_floor = module.build(case.given, tmp_path, 0.08, 1, bands=bands)
+    made = case.made
+    module.build(case.given, tmp_path, 0.08, 1)
+    assert case.made == made, "other slices need no fusion"
+    numbers = write_all(results, tmp_path, 0.08, map_T_floor, bands)
+    names = "costmap.png", "costmap_0.20_0.60.png", "costmap_5.00_6.00.png"
+    whole, low, high = (cv2.imread(str(tmp_path / name), 0) for name in names)
+    assert whole is not None and low is not None and high is not None
+    assert (high == 205).all(), "nothing was seen there"
+    assert 0 < (low == 0).sum() <= (whole == 0).sum()
+    assert yaml.safe_load((tmp_path / "costmap_0.20_0.60.yaml").read_text())["image"] == "costmap_0.20_0.60.png"
+
+    las, count = (tmp_path / "cloud.las").read_bytes(), int(numbers["vertices"])
+    assert las[:4] == b"LASF" and las[24:26] == bytes([1, 2])
+    assert struct.unpack_from("<HI", las, 94) == (227, 227) and struct.unpack_from("<BHI", las, 104) == (2, 26, count)
+    step, corner = np.array(struct.unpack_from("<3d", las, 131)), np.array(struct.unpack_from("<3d", las, 155))
+    bounds = np.array(struct.unpack_from("<6d", las, 179)).reshape(3, 2)
+    rows = np.frombuffer(las, np.dtype([("xyz", "<i4", 3), ("rest", "V14")]), offset=227)
+    points = rows["xyz"] * step + corner
+    assert len(points) == count
+    np.testing.assert_allclose(np.stack([points.max(0), points.min(0)], axis=1), bounds, atol=1e-3)
+
+    report = write_report(tmp_path, "a drive", 0.08, numbers).read_text()
+    pictures = [line.split("(")[-1].rstrip(")") for line in report.splitlines() if line.startswith("![")]
+    assert {"mesh_height.png", "mesh_grey.png", "depth_1.png", "depth_2.png"} <= set(pictures)
+    for name in pictures:
+        picture = cv2.imread(str(tmp_path / name))
+        assert picture is not None and picture.std() > 5
+
+
+def test_a_mesh_is_drawn_from_before_and_the_nearer_face_hides_the_other() -> None:
+    square = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0]], float)  # seen from below: clockwise from above
+    points = np.concatenate([square, square + np.array([0, 0, 0.5])])
+    colours = np.repeat(np.array([[250, 0, 0], [0, 0, 250]], np.uint8), 4, axis=0)
+    up = np.array([[0, 2, 1], [0, 3, 2]])
+    image = render_mesh(points, colours, np.concatenate([up, up + 4]), 200)
+    blue, red = image[..., 0] > image[..., 2] + 50, image[..., 2] > image[..., 0] + 50
+    assert red.sum() > 1.1 * blue.sum() > 0, "the upper one hides a part of the lower one"
+    assert (render_mesh(points, colours, up[:, ::-1], 200) == 255).all(), "from behind there is nothing"
 
 
 def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
@@ -223,4 +269,5 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
     save_map(small_map()[1], tmp_path / "store")
     assert "--images SOURCE" in fails(tmp_path / "store", "-o", tmp_path / "out")
     assert "no such file" in fails(tmp_path / "store", "-o", tmp_path / "out", "--images", "gone.mcap")
+    assert "--slice takes two heights" in fails(tmp_path / "store", "-o", tmp_path / "out", "--slice", "0.6,0.1")
     assert "--voxel" in fails(tmp_path / "store", "-o", tmp_path / "out", "--voxel", "0")

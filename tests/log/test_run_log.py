@@ -44,6 +44,7 @@ from stereo_sfm.types import (
     Dropped,
     Frame,
     Keyframe,
+    LiveDepth,
     LoopResult,
     MapUpdate,
     Observations,
@@ -163,6 +164,7 @@ def _write(path: Path, order: np.random.Generator | None, imu: Imu | None = None
         alive = [s for s in streams if s]
         log.put(alive[0 if order is None else order.integers(len(alive))].pop())
     log.put(Applied(1, 3))
+    log.put(LiveDepth(5, START_NS, np.full((4, 6), 1500, np.uint16), np.ones(4), np.ones((2, 3), np.float32)))
     log.put(Dropped(9, START_NS, "ring", "full", 2))
     log.put(START_CHECK)
     log.put(Health("track", 5, 30.0, 1, 1.0, 2.0, 3.0, 0))

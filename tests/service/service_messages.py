@@ -21,7 +21,7 @@ from stereo_sfm.service.messages import (
     Status,
 )
 from stereo_sfm.service.publisher import Reply, checked
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, LiveDepth
 from tests.synthetic import pinhole_rig
 
 NAN6 = np.full(6, np.nan)
@@ -51,6 +51,13 @@ def pose_update(frame_id: int = 0, odom_T_body: F64 | None = None, **others: Any
         "down": np.zeros(3),
     }
     return PoseUpdate(**(values | others))
+
+
+def live_depth(frame_id: int = 0) -> LiveDepth:
+    depth = np.arange(24, dtype=np.uint16).reshape(4, 6) * 100
+    points = np.array([[0.5, 0.2, 2.0], [-0.5, 0.1, 3.0]], np.float32)
+    stamp = 10**9 + frame_id * 33_333_333
+    return LiveDepth(frame_id, stamp, depth, np.array([5.0, 5.0, 2.5, 1.5]), points)
 
 
 def status(state: ServiceState = ServiceState.RUNNING, **others: Any) -> Status:

@@ -17,6 +17,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.errors import StereoSfmError
@@ -29,7 +30,7 @@ from stereo_sfm.service.outputs.foxglove_clients import SERVICES
 from stereo_sfm.service.outputs.foxglove_server import KINDS, REPORT, STATUS, FoxgloveOutput
 from stereo_sfm.service.outputs.settings import FoxgloveConfig
 from stereo_sfm.service.publisher import Reply
-from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
+from tests.service.service_messages import FakeService, cloud, health, live_depth, picture, pose_update, started, status
 from tests.synthetic import pinhole_rig
 
 connect = pytest.importorskip("websockets.sync.client").connect
@@ -80,7 +81,7 @@ def _subscribe(client: Any, channels: dict[int, int]) -> None:
 
 
 def _everything(output: FoxgloveOutput) -> None:
-    for message in (started(), pose_update(1), status(), cloud(), picture(), health()):
+    for message in (started(), pose_update(1), status(), cloud(), picture(), health(), live_depth(1)):
         output.put(message)
     output.put(Event(0, "warning", "tracker", "lost in aisle 3"))
 
@@ -93,11 +94,14 @@ def test_every_topic_is_there_before_the_first_message() -> None:
 def test_the_topics_are_those_of_the_log() -> None:
     with _serving() as (output, client):
         _everything(output)
-        known = _channels(client, 16)
+        known = _channels(client, 19)
         names = set(known) - {STATUS, REPORT}
         assert names <= set(topics.BY_NAME) and {topics.TF, topics.POINTS, topics.LEFT_IMAGE, topics.LOG} <= names
         assert all(known[name]["schemaName"] in topics.BY_NAME[name].schema.split("|") for name in names)
-        wanted = {1: topics.ODOMETRY, 2: topics.LEFT_IMAGE, 3: topics.POINTS, 4: STATUS}
+        wanted = {
+            1: topics.ODOMETRY, 2: topics.LEFT_IMAGE, 3: topics.POINTS, 4: STATUS, 5: topics.LIVE_DEPTH,
+            6: topics.OBSTACLES,
+        }  # fmt: skip
         _subscribe(client, {i: known[topic]["id"] for i, topic in wanted.items()})
         _everything(output)
         got: dict[int, bytes] = {}
@@ -116,6 +120,11 @@ def test_the_topics_are_those_of_the_log() -> None:
     points = PointCloud.FromString(got[3])
     assert len(points.data) // points.point_stride == len(cloud().points)
     assert json.loads(got[4])["state"] == "running"
+    depth, obstacles = RawImage.FromString(got[5]), PointCloud.FromString(got[6])
+    assert (depth.encoding, depth.width, depth.height, depth.step, depth.frame_id) == ("16UC1", 6, 4, 12, "cam0")
+    np.testing.assert_array_equal(np.frombuffer(depth.data, "<u2").reshape(4, 6), live_depth().depth_mm)
+    rows = np.frombuffer(obstacles.data, np.uint8).reshape(-1, obstacles.point_stride)
+    np.testing.assert_array_equal(rows[:, :12].copy().view("<f4"), live_depth().obstacles)
 
 
 def test_the_level_is_the_measured_one_where_there_is_an_imu() -> None:

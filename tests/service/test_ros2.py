@@ -17,7 +17,7 @@ from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.ros2 import SERVICES, Ros2Output
 from stereo_sfm.service.outputs.settings import Ros2Config
 from stereo_sfm.service.publisher import Reply
-from tests.service.service_messages import NAN6, FakeService, cloud, health, pose_update, started, status
+from tests.service.service_messages import NAN6, FakeService, cloud, health, live_depth, pose_update, started, status
 from tests.synthetic import pinhole_rig
 
 rclpy = pytest.importorskip("rclpy")
@@ -114,6 +114,36 @@ def test_nodes_receive_poses_cloud_path_and_plan() -> None:
     ].pose.position.x == pytest.approx(3)
     grid = listener.got["floor_plan"][0]
     assert (grid.info.width, grid.info.height) and set(grid.data) <= {-1, 0, 100} and 0 in grid.data
+
+
+def test_nodes_receive_depth_and_obstacles() -> None:
+    """As Nav2's layers do: the obstacles are in the robot's frame."""
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+    sent = live_depth(3)
+    with _talking() as (output, listener):
+        for topic, kind in (("depth", Image), ("camera_info", CameraInfo), ("obstacles", PointCloud2)):
+            listener.got[topic] = []
+            listener.node.create_subscription(kind, topic, listener.got[topic].append, qos_profile_sensor_data)
+        output.put(pose_update(2))
+
+        def received() -> bool:
+            output.put(sent)
+            return all(listener.got.values())
+
+        listener.until(received)
+    depth, camera, cloud_ = (listener.got[name][0] for name in ("depth", "camera_info", "obstacles"))
+    assert (depth.encoding, depth.width, depth.height, depth.step) == ("16UC1", 6, 4, 12)
+    np.testing.assert_array_equal(np.frombuffer(depth.data, "<u2").reshape(4, 6), sent.depth_mm)
+    assert (camera.width, camera.height, camera.k[0], camera.p[2]) == (6, 4, 5.0, 2.5)
+    assert depth.header == camera.header and depth.header.frame_id == ros2.LEFT_FRAME
+    stamp = pose_update(3).unix_ns
+    assert cloud_.header.stamp.sec * 10**9 + cloud_.header.stamp.nanosec == stamp
+    assert cloud_.header.frame_id == "base_link"
+    points = np.frombuffer(cloud_.data, "<f4").reshape(-1, 3)
+    expected = [[p[2], -p[0], -p[1]] for p in sent.obstacles]  # the camera looks ahead
+    np.testing.assert_allclose(points, expected, atol=1e-6)
 
 
 def test_an_unknown_velocity_is_zero_with_a_large_variance_and_the_camera_clock_is_simulated_time() -> None:

@@ -22,6 +22,7 @@ from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import require
@@ -46,6 +47,7 @@ from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.settings import FoxgloveConfig, SecurityConfig
 from stereo_sfm.service.outputs.web_server import WebServer
 from stereo_sfm.service.publisher import ServiceClient
+from stereo_sfm.types import LiveDepth
 
 if TYPE_CHECKING:
     from stereo_sfm.service.config import RobotConfig
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
 
 STATUS, REPORT = "/service/status", "/service/health"
 JPEG_QUALITY = 80
+DEPTH_TOPICS = (topics.LIVE_DEPTH, topics.LIVE_CALIBRATION, topics.OBSTACLES)  # as `foxglove.live_depth` makes them
 KINDS: dict[str, Any] = {
     topics.LEFT_CALIBRATION: CameraCalibration,
     topics.RIGHT_CALIBRATION: CameraCalibration,
@@ -68,6 +71,9 @@ KINDS: dict[str, Any] = {
     topics.LEFT_IMAGE: CompressedImage,
     topics.FEATURES: ImageAnnotations,
     topics.LOG: Log,
+    topics.LIVE_DEPTH: RawImage,
+    topics.LIVE_CALIBRATION: CameraCalibration,
+    topics.OBSTACLES: PointCloud,
 }
 
 
@@ -129,6 +135,7 @@ class FoxgloveOutput:
             PreviewImage: self._image,
             HealthReport: self._health,
             Event: self._event,
+            LiveDepth: self._depth,
         }
         writers[type(message)](message)
 
@@ -182,6 +189,10 @@ class FoxgloveOutput:
             self._log(topics.LEFT_IMAGE, image)
         colors = age_colors(preview.age, preview.inlier)
         self._log(topics.FEATURES, foxglove.point_annotations(preview.stamp_ns, preview.uv, colors))
+
+    def _depth(self, live: LiveDepth) -> None:
+        for topic, message in zip(DEPTH_TOPICS, foxglove.live_depth(live), strict=True):
+            self._log(topic, message)
 
     def _health(self, report: HealthReport) -> None:
         for health in report.stages.values():

@@ -15,8 +15,6 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.service.messages import PoseUpdate
 from stereo_sfm.types import F64
 
-_FORWARD = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # optical axes seen by the robot
-
 
 @dataclass(frozen=True, eq=False)
 class RobotPose:
@@ -44,10 +42,9 @@ class RobotAxes:
     """Converts poses and points of the service to the robot's axes, for one rig."""
 
     def __init__(self, rig: Rig) -> None:
-        own_body = not np.allclose(rig.body_T_left, np.eye(4))
-        self.base_T_left: F64 = rig.body_T_left if own_body else _FORWARD
+        self.base_T_left: F64 = rig.base_T_left
         self._left_T_base = se3.inverse(self.base_T_left)
-        base_T_body: F64 = np.eye(4) if own_body else _FORWARD
+        base_T_body = self.base_T_left @ se3.inverse(rig.body_T_left)
         self._body_T_base = se3.inverse(base_T_body)
         self._world_turn = np.kron(np.eye(2), self.base_T_left[:3, :3])
         self._body_turn = np.kron(np.eye(2), base_T_body[:3, :3])

@@ -18,7 +18,7 @@ from stereo_sfm.service.outputs.floor_grid import FloorGrids, aligned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.settings import Ros2Config
 from stereo_sfm.service.publisher import COMMANDS, ServiceClient
-from stereo_sfm.types import F64, U8
+from stereo_sfm.types import F64, U8, LiveDepth
 
 if TYPE_CHECKING:
     from stereo_sfm.service.config import RobotConfig
@@ -55,7 +55,7 @@ def make(config: RobotConfig) -> Ros2Output:
 class Ros2Output:
     """A node of ROS 2 as a publisher."""
 
-    wants: frozenset[type[ServiceMessage]] = frozenset({Started, Status, PoseUpdate, MapCloud, HealthReport})
+    wants: frozenset[type[ServiceMessage]] = frozenset({Started, Status, PoseUpdate, MapCloud, HealthReport, LiveDepth})
     preview_hz = 0.0
 
     def __init__(self, config: Ros2Config) -> None:
@@ -64,6 +64,7 @@ class Ros2Output:
         self._axes: RobotAxes | None = None
         self._health: HealthReport | None = None
         self._stamp_ns = 0  # of the newest pose
+        self._clock_ns = 0  # wall clock minus the camera's
         self._plans = FloorGrids(self._take_plan)
         self._topics: dict[str, Any] = {}
         self._node: Any = None
@@ -109,6 +110,7 @@ class Ros2Output:
             MapCloud: self._cloud,
             Status: self._status,
             HealthReport: self._take_health,
+            LiveDepth: self._depth,
         }
         with self._lock:
             takers[type(message)](message)
@@ -123,8 +125,8 @@ class Ros2Output:
     def _advertise(self) -> None:
         from geometry_msgs.msg import PoseWithCovarianceStamped
         from nav_msgs.msg import OccupancyGrid, Odometry, Path
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-        from sensor_msgs.msg import PointCloud2
+        from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
+        from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         kinds: list[tuple[str, Any, Any]] = [
@@ -133,6 +135,9 @@ class Ros2Output:
             ("path", Path, latched),
             ("map_points", PointCloud2, latched),
             ("floor_plan", OccupancyGrid, latched),
+            ("depth", Image, qos_profile_sensor_data),
+            ("camera_info", CameraInfo, qos_profile_sensor_data),
+            ("obstacles", PointCloud2, qos_profile_sensor_data),
         ]
         if self._has("diagnostic_msgs", "diagnostics"):
             from diagnostic_msgs.msg import DiagnosticArray
@@ -197,6 +202,7 @@ class Ros2Output:
             return
         c = self._config
         stamp = self._stamp_ns = update.stamp_ns if c.use_sim_time else update.unix_ns
+        self._clock_ns = update.unix_ns - update.stamp_ns
         at = self._axes.pose(update)
         self._topics["odom"].publish(ros.odometry(stamp, c.odom_frame, c.base_frame, at))
         if "/tf" in self._topics:
@@ -217,6 +223,18 @@ class Ros2Output:
         stamp, frame = self._now(), self._config.map_frame
         self._topics["map_points"].publish(ros.cloud(stamp, frame, self._axes.points(cloud.points.astype(float))))
         self._topics["path"].publish(ros.path(stamp, frame, self._axes.cameras(cloud.map_T_kf)))
+
+    def _depth(self, live: LiveDepth) -> None:
+        """Depth in the left camera, obstacles in the robot's frame."""
+        from stereo_sfm.service.outputs import ros2_messages as ros
+
+        if self._axes is None:
+            return
+        stamp = live.stamp_ns if self._config.use_sim_time else live.stamp_ns + self._clock_ns
+        self._topics["depth"].publish(ros.depth_image(stamp, LEFT_FRAME, live.depth_mm))
+        self._topics["camera_info"].publish(ros.camera_info(stamp, LEFT_FRAME, live))
+        points = self._axes.points(live.obstacles.astype(float))
+        self._topics["obstacles"].publish(ros.cloud(stamp, self._config.base_frame, points))
 
     def _take_health(self, health: HealthReport) -> None:
         self._health = health

@@ -13,7 +13,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.service.messages import HealthReport, ServiceState, Status
 from stereo_sfm.service.outputs.floor_grid import FloorGrid
 from stereo_sfm.service.outputs.robot_axes import RobotPose
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, U16, LiveDepth
 
 UNKNOWN_VARIANCE = 1e6  # of a velocity that is not known
 LATE_MS = 100.0  # latency that causes a warning
@@ -99,6 +99,31 @@ def cloud(stamp_ns: int, frame: str, points: F64) -> Any:
     )  # fmt: skip
     out.data = _bytes(np.ascontiguousarray(points, "<f4").tobytes(), "B")
     return out
+
+
+def depth_image(stamp_ns: int, frame: str, depth_mm: U16) -> Any:
+    """(H, W) -> sensor_msgs/Image of 16 bit millimetres (REP 118)."""
+    from sensor_msgs.msg import Image
+
+    height, width = depth_mm.shape
+    out = Image(
+        header=header(stamp_ns, frame), height=height, width=width, encoding="16UC1", is_bigendian=0, step=2 * width
+    )
+    out.data = _bytes(depth_mm.astype("<u2").tobytes(), "B")
+    return out
+
+
+def camera_info(stamp_ns: int, frame: str, live: LiveDepth) -> Any:
+    """sensor_msgs/CameraInfo of a depth image, which has no distortion."""
+    from sensor_msgs.msg import CameraInfo
+
+    height, width = live.depth_mm.shape
+    fx, fy, cx, cy = live.pinhole.tolist()
+    return CameraInfo(
+        header=header(stamp_ns, frame), height=height, width=width, distortion_model="plumb_bob", d=[0.0] * 5,
+        k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], r=np.eye(3).ravel().tolist(),
+        p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )  # fmt: skip
 
 
 def grid(stamp_ns: int, frame: str, plan: FloorGrid) -> Any:

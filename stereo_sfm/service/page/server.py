@@ -10,6 +10,7 @@ from stereo_sfm.service.outputs.access import Access, access
 from stereo_sfm.service.outputs.settings import SecurityConfig
 from stereo_sfm.service.outputs.web_server import WebServer
 from stereo_sfm.service.publisher import ServiceClient
+from stereo_sfm.types import LiveDepth
 
 if TYPE_CHECKING:
     from stereo_sfm.service.config import RobotConfig
@@ -25,7 +26,7 @@ def make(config: RobotConfig) -> PageOutput:
 class PageOutput:
     """Serves the page in a thread."""
 
-    wants = EVERYTHING
+    wants = EVERYTHING - {LiveDepth}
 
     def __init__(
         self,

@@ -1,0 +1,112 @@
+"""Pictures of a reconstruction for its report: the mesh seen from a corner, and depth images."""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.dense.depth import DepthImage
+from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.maps.floor import HIGH
+from stereo_sfm.types import F32, F64, I64, U8
+
+WIDTH_PX = 1200
+DOWN_DEG, AROUND_DEG = 50.0, 25.0  # direction of view: into shelves on both sides of an aisle, not only on their tops
+AMBIENT = 0.55  # share of the light that reaches every face
+NEAR_M, FAR_M = 0.5, 6.0  # of the colours of depth images
+
+
+def write_mesh_pictures(folder: Path, points: F64, grey: U8, triangles: I64) -> None:
+    """mesh_height.png and mesh_grey.png: the mesh below a ceiling, coloured by height and by grey level."""
+    below = (points[triangles][:, :, 2] < HIGH).all(axis=1) if len(triangles) else np.zeros(0, bool)
+    triangles = triangles[below]
+    used = np.unique(triangles)
+    if not len(used):
+        return
+    low, high = np.quantile(points[used, 2], [0.02, 0.98])
+    share = np.clip((points[:, 2] - low) / max(high - low, 1e-3), 0, 1)
+    coloured = _turbo((255 * share).astype(np.uint8)[None])[0]
+    plain = np.repeat(grey[:, None], 3, axis=1)
+    for name, colours in (("mesh_height.png", coloured), ("mesh_grey.png", plain)):
+        _write(folder / name, render_mesh(points, colours, triangles))
+
+
+def render_mesh(points: F64, colours: U8, triangles: I64, width: int = WIDTH_PX) -> U8:
+    """(H, W, 3) blue green red: faces that look at the viewer, shaded, on white. Args: (V, 3) m, (V, 3), (T, 3)."""
+    down, around = math.radians(DOWN_DEG), math.radians(AROUND_DEG)
+    ahead = np.array([math.cos(down) * math.cos(around), math.cos(down) * math.sin(around), -math.sin(down)])
+    right = np.array([math.sin(around), -math.cos(around), 0.0])
+    seen = points @ np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    corner = seen[np.unique(triangles)]
+    low, high = corner.min(axis=0), corner.max(axis=0)
+    scale = (width - 1) / max(float(high[0] - low[0]), 1e-3)
+    height = min(2 * width, int(scale * float(high[1] - low[1])) + 1)
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    facing = -(normals @ ahead) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    image = np.full((height, width, 3), 255, np.uint8)
+    depth = np.full((height, width), np.inf, np.float32)
+    at = (seen - low) * np.array([scale, scale, 1.0])
+    _rasterize(image, depth, at, triangles, colours, facing)
+    return image
+
+
+@njit
+def _rasterize(image, depth, at, triangles, colours, facing):
+    h, w = depth.shape
+    for t in range(len(triangles)):
+        if facing[t] <= 0:
+            continue
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        xa, ya, xb, yb, xc, yc = at[i, 0], at[i, 1], at[j, 0], at[j, 1], at[k, 0], at[k, 1]
+        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+        if abs(area) < 1e-9:
+            continue
+        light = AMBIENT + (1 - AMBIENT) * facing[t]
+        for y in range(max(0, math.ceil(min(ya, yb, yc))), min(h - 1, math.floor(max(ya, yb, yc))) + 1):
+            for x in range(max(0, math.ceil(min(xa, xb, xc))), min(w - 1, math.floor(max(xa, xb, xc))) + 1):
+                p = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) / area
+                q = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) / area
+                r = 1 - p - q
+                if p < 0 or q < 0 or r < 0:
+                    continue
+                z = p * at[i, 2] + q * at[j, 2] + r * at[k, 2]
+                if z < depth[y, x]:
+                    depth[y, x] = z
+                    for n in range(3):
+                        mixed = p * colours[i, n] + q * colours[j, n] + r * colours[k, n]
+                        image[y, x, n] = np.uint8(light * mixed)
+
+
+def write_depth_picture(path: Path, depth: DepthImage) -> None:
+    """The image, its ranges (near red, far blue, unknown black) and their standard deviations, side by side."""
+    parts = [np.repeat(depth.grey[..., None], 3, axis=2), coloured_ranges(depth.ranges)]
+    relative = np.nan_to_num(depth.sigmas / depth.ranges, nan=0.0)
+    parts.append(_turbo(np.clip(relative * 255 / 0.1, 0, 255).astype(np.uint8)))  # red: 10 % of the range
+    parts[2][~np.isfinite(depth.ranges)] = 0
+    _write(path, np.concatenate(parts, axis=0 if depth.grey.shape[1] > depth.grey.shape[0] else 1))
+
+
+def coloured_ranges(ranges: F32) -> U8:
+    """(H, W) metres -> (H, W, 3) blue green red by the inverse, as disparities look."""
+    share = (1 / np.clip(ranges, NEAR_M, FAR_M) - 1 / FAR_M) / (1 / NEAR_M - 1 / FAR_M)
+    out = _turbo((255 * np.nan_to_num(share, nan=0.0)).astype(np.uint8))
+    out[~np.isfinite(ranges)] = 0
+    return out
+
+
+def _turbo(share: U8) -> U8:
+    import cv2
+
+    return np.asarray(cv2.applyColorMap(share, cv2.COLORMAP_TURBO), np.uint8)
+
+
+def _write(path: Path, picture: Any) -> None:
+    import cv2
+
+    cv2.imwrite(str(path), np.ascontiguousarray(picture))
