@@ -70,6 +70,7 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
         options: dict[str, Any] = {"num_cpus": 1, "max_retries": limits.retries}
         if limits.memory_gb:
             options["memory"] = int(limits.memory_gb * 1e9)
+            _check_memory(ray.nodes(), options["memory"])
         remote = ray.remote(**options)(_within)
         waiting, results = list(jobs), dict[str, Result]()
         pending: dict[Any, Job] = {}
@@ -92,6 +93,15 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
+
+
+def _check_memory(nodes: Sequence[Mapping[str, Any]], wanted: int) -> None:
+    """Raises StereoSfmError where no computer has so many bytes: Ray would wait for one that has."""
+    most = max((node["Resources"].get("memory", 0.0) for node in nodes if node["Alive"]), default=0.0)
+    if most < wanted:
+        raise StereoSfmError(
+            f"no computer has {wanted / 1e9:g} GB of memory for a job, at most {most / 1e9:.1f} GB: lower job.memory_gb"
+        )
 
 
 @contextmanager

@@ -106,13 +106,13 @@ def _report(plan: Plan, folder: Path, query: str | None) -> int:
 
 
 def _upload(path: Path, to: str, mbit: float) -> int:
-    from stereo_sfm.storage.folders import Pace, send_folder
+    from stereo_sfm.storage.folders import Pace, cache_root, send_folder
     from stereo_sfm.storage.remote import Remote
     from stereo_sfm.storage.spool import Spool
 
     target, bytes_s = Remote.of(to), mbit * 1e6 / 8
     if path.is_file():
-        Spool(path, target).send(Pace(bytes_s), keep=True)
+        Spool(path.resolve(), target).send(Pace(bytes_s), keep=cache_root().resolve() not in path.resolve().parents)
         print(f"sent {path} to {target}")
         return 0
     if not path.is_dir():

@@ -7,6 +7,7 @@ moment at which anything counts, so a worker that is killed before has changed n
 
 from __future__ import annotations
 
+import itertools
 import json
 import tempfile
 import time
@@ -21,6 +22,7 @@ from stereo_sfm.fleet.editing import Checkout, checked_out, session_id
 from stereo_sfm.fleet.plan import Walk
 from stereo_sfm.fleet.versions import Version, history
 from stereo_sfm.jobs import Result
+from stereo_sfm.log.reader import LogReader
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import fetch_into, send_folder
 from stereo_sfm.storage.remote import Remote
@@ -64,6 +66,10 @@ def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
                 save_map(session, folder / "map", compress=False)
                 return _about(session, session_id(session)) | {"ok": True, "map": str(folder / "map"), "stats": None}
             source = str(here)
+        elif walk.state:
+            with LogReader(Remote.of(source)) as reader:
+                if reader.truncated:
+                    return {"ok": False, "error": f"it is cut off ({reader.truncated}): send it again"}
     except StereoSfmError as error:
         return {"ok": False, "error": str(error), "lasting": not isinstance(error, objects.Unreachable)}
     result = run_one(BatchTask(source, str(folder / "run"), config, True))
@@ -117,15 +123,7 @@ def update_store(root: Remote, walks: list[Walk], config: Config, results: Mappi
         return {"ok": True, "version": done["version"], "failed": done["failed"], "resumed": True}
     begin = time.perf_counter()
     place = root / store / "map"
-    for attempt in range(WRITERS):
-        try:
-            outcomes, version = _put_all(place, mine, config)
-            break
-        except objects.Changed:
-            if attempt == WRITERS - 1:
-                raise
-    else:
-        raise AssertionError
+    outcomes, version = _put_all(place, mine, config)
     failed = {walk.name: why for walk, (why, _) in outcomes.items() if why}
     # Walks whose recordings were deleted since keep their rows.
     rows = before | {walk.name: walk_row(walk, mine[walk], *outcomes[walk]) for walk in walks}
@@ -150,9 +148,19 @@ Outcomes = dict[Walk, tuple[str, str]]  # why a walk is not in the map, "" if it
 def _put_all(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tuple[Outcomes, Version | None]:
     """The sessions of a night put into the version that counts, as one new version; None: the store has none.
 
-    Raises:
-        Changed: another program was faster.
+    Where another program is faster, they are put into its version.
     """
+    for attempt in itertools.count(1):
+        try:
+            return _put_once(place, mine, config)
+        except objects.Changed:
+            if attempt == WRITERS:
+                raise
+    raise AssertionError  # the count does not end
+
+
+def _put_once(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tuple[Outcomes, Version | None]:
+    """Raises Changed if another program was faster."""
     from stereo_sfm.export.store_plan import write_store_plan
 
     outcomes: Outcomes = {}

@@ -14,7 +14,7 @@ KEPT = 512  # pages, 32 MiB: the index and the first images, which `info` reads 
 NEAR = 4  # pages left out that still count as in order: the message index between two chunks of a recording
 
 
-class RangeStream(io.RawIOBase):
+class RangeStream(io.BufferedIOBase):  # raw ones are wrapped by readers, and closed with the wrapper
     """A file object for reading.
 
     Attributes:
@@ -75,9 +75,6 @@ class RangeStream(io.RawIOBase):
         while len(self._pages) > KEPT:
             self._pages.popitem(last=False)
         return out
-
-    def readall(self) -> bytes:
-        return self.read()
 
     def ranges(self, wanted: list[tuple[int, int]]) -> list[bytes]:
         """Many small parts, each (start, length), exactly."""

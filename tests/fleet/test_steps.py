@@ -143,7 +143,7 @@ def test_the_report_names_what_failed(
     carry_out(plan)
     assert main(["fleet", "report", str(tmp_path / "plan.toml"), "-o", str(tmp_path / "page")]) == 0
     printed = capsys.readouterr().out
-    assert "1 stores, 2 nights, 2 walks, 1 of them in no map" in printed and "r2: " in printed
+    assert "1 stores, 2 nights, 2 walks, 1 of them in no map" in printed and "r2/2026-11-26_2200.mcap: " in printed
     page = (tmp_path / "page" / "fleet.html").read_text()
     assert "<svg" in page and "r2/2026-11-26_2200.mcap" in page
     assert (tmp_path / "page" / "stores.parquet").is_file()
