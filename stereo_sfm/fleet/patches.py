@@ -31,8 +31,9 @@ def expanded(data: bytes, size: int, old: bytes | None = None) -> bytes | None:
     try:
         if zstandard.frame_content_size(data) != size:
             return None
-        dictionary = {} if old is None else {"dict_data": _dictionary(old)}
-        return zstandard.ZstdDecompressor(max_window_size=1 << 31, **dictionary).decompress(data, max_output_size=size)
+        dictionary = None if old is None else _dictionary(old)
+        reader = zstandard.ZstdDecompressor(dict_data=dictionary, max_window_size=1 << 31)
+        return reader.decompress(data, max_output_size=size)
     except (zstandard.ZstdError, MemoryError):
         return None
 

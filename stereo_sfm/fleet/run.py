@@ -11,6 +11,7 @@ from stereo_sfm.fleet.plan import UNDATED, Plan, Walk
 from stereo_sfm.fleet.steps import job_name, map_walk, read_json, update_store
 from stereo_sfm.jobs import Job, Limits, Result, run_jobs
 from stereo_sfm.storage import objects
+from stereo_sfm.storage.spool import SUM
 
 
 def jobs_of(plan: Plan, walks: list[Walk]) -> list[Job]:
@@ -59,6 +60,7 @@ def forget_images(plan: Plan, walks: list[Walk], today: datetime.date) -> int:
             continue
         place = plan.root / walk.store / "walks" / walk.name
         names = [name for name, _, _ in objects.listed(place)]
-        objects.delete([place / name for name in names] if names else [place])
+        beside = place.parent / f"{place.name}{SUM}"
+        objects.delete([place / name for name in names] if names else [place, beside])
         deleted += walk.bytes
     return deleted

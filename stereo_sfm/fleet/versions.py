@@ -106,8 +106,9 @@ def read_version(store: Remote, name: str) -> Version:
     """
 
     def make(data: dict[str, Any]) -> Version:
-        data["files"] = {name: StoredFile(**file) for name, file in data["files"].items()}
-        return Version(**{**data, "changes": tuple(data["changes"]), "name": name})
+        files = {key: StoredFile(**file) for key, file in data["files"].items()}
+        fields: dict[str, Any] = {**data, "files": files, "changes": tuple(data["changes"]), "name": name}
+        return Version(**fields)
 
     return _parsed(store / name, objects.read(store / name), make)
 

@@ -91,13 +91,14 @@ class LogReader:
         """
         self.path = path
         try:
-            self._stream: IO[bytes] = RangeStream(path) if isinstance(path, Remote) else open_regular(path)
+            stream: Any = RangeStream(path) if isinstance(path, Remote) else open_regular(path)
         except OSError as error:
             raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
         self.truncated = ""
         self.by_time = True  # False: messages come in the order of the file, for one whose clock was set back
         self._times: dict[int, I64] | None = None
-        self._distant = self._stream if isinstance(self._stream, RangeStream) else None
+        self._stream: IO[bytes] = stream
+        self._distant: RangeStream | None = stream if isinstance(stream, RangeStream) else None
         self.bytes = self._stream.seek(0, io.SEEK_END)
         try:
             scan.check_magic(self._stream, path)

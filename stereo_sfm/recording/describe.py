@@ -155,7 +155,8 @@ def _regularity(reader: LogReader, topic: TopicInfo) -> tuple[Rate, int, int]:
             nan = float("nan")
             return Rate(topic.count, (topic.count - 1) * 1e9 / (last - first), nan, 0, 0.0, 0, 0), first, last
     stamps = reader.stamps(topic.topic)
-    return rate_of(stamps), *((int(stamps[0]), int(stamps[-1])) if len(stamps) else (0, 0))
+    first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (0, 0)
+    return rate_of(stamps), first, last
 
 
 @contextmanager

@@ -72,18 +72,13 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
             options["credential_provider"] = Boto3CredentialProvider()
     plain = os.environ.get("AWS_ENDPOINT_URL", "").startswith("http://")
     client = {"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=REQUEST_S)}
-    return from_url(
-        f"{scheme}://{bucket}",
-        client_options={**client, **({"allow_http": True} if plain else {})},
-        retry_config={
-            "max_retries": TRIES,
-            "retry_timeout": timedelta(seconds=patience_s),
-            "backoff": {
-                "init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=10), "base": 2,
-            },
-        },
-        **options,
-    )  # fmt: skip
+    options["client_options"] = {**client, **({"allow_http": True} if plain else {})}
+    options["retry_config"] = {
+        "max_retries": TRIES,
+        "retry_timeout": timedelta(seconds=patience_s),
+        "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=10), "base": 2},
+    }
+    return from_url(f"{scheme}://{bucket}", **options)
 
 
 def _of(remote: Remote) -> Any:

@@ -43,9 +43,9 @@ class RangeStream(io.BufferedIOBase):  # raw ones are wrapped by readers, and cl
         self._at = max({io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence] + offset, 0)
         return self._at
 
-    def read(self, size: int = -1, /) -> bytes:
+    def read(self, size: int | None = -1, /) -> bytes:
         """As of any file: fewer bytes only at the end."""
-        stop = self._size if size < 0 else min(self._at + size, self._size)
+        stop = self._size if size is None or size < 0 else min(self._at + size, self._size)
         if stop <= self._at:
             return b""
         first, end = self._at // PAGE, (stop - 1) // PAGE + 1
