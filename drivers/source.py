@@ -16,6 +16,7 @@ from stereo_sfm.drivers import registry
 from stereo_sfm.drivers.driver import Driver
 from stereo_sfm.drivers.options import SourceOptions, read_options
 from stereo_sfm.errors import StereoSfmError, did_you_mean
+from stereo_sfm.storage.remote import Remote, is_uri, place
 
 if TYPE_CHECKING:
     from stereo_sfm.calib.rig import Rig
@@ -213,13 +214,29 @@ def _split(text: str) -> tuple[str, str, str]:
     head, _, query = text.partition("?")
     kind = _kind(text)
     if kind is not None:
-        return kind, head.partition(":")[2], query
+        named = head.partition(":")[2]
+        return kind, _near(named) if is_uri(named) and registry.driver(kind).cameras is None else named, query
+    if is_uri(head):
+        near = _near(head)
+        return (registry.recognise(Path(near)), near, query) if not is_uri(near) else ("mcap", near, query)
     if Path(text).expanduser().exists():
         head, query = text, ""
     path = Path(head).expanduser()
     if not path.exists():
         raise _unknown(head)
     return registry.recognise(path), str(path), query
+
+
+def _near(uri: str) -> str:
+    """Where a source in a bucket is read: an MCAP file there, by ranges; others in a copy on this computer."""
+    found = place(uri)
+    if not isinstance(found, Remote):
+        return str(found)
+    if found.suffix == ".mcap":
+        return str(found)
+    from stereo_sfm.storage.folders import fetch
+
+    return str(fetch(found))
 
 
 def _unknown(text: str) -> StereoSfmError:

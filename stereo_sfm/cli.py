@@ -22,6 +22,7 @@ COMMANDS: dict[str, str] = {
     "replay": "repeat a run from its log, bit for bit",
     "viz": "show a run, a saved map or a recording in rerun",
     "batch": "run many recordings, on this machine or on a cluster",
+    "fleet": "map the walks of many stores each night, in a bucket and on a cluster",
     "serve": "run continuously on a robot: publish poses, keep the map up to date, limit the size of recordings",
     "service": "install the service on this computer, remove it, or show its state",
     "record": "write a source to an MCAP file",

@@ -18,6 +18,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.errors",
     "stereo_sfm.folder_lock",
     "stereo_sfm.input_file",
+    "stereo_sfm.storage",
     "stereo_sfm.kernel_cache",
     "stereo_sfm.timing",
     "stereo_sfm.messages",
@@ -41,7 +42,9 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.viz",
     "stereo_sfm.dense",
     "stereo_sfm.pipeline",
+    "stereo_sfm.jobs",
     "stereo_sfm.eval",
+    "stereo_sfm.fleet",
     "stereo_sfm.system",
     "stereo_sfm.demo",
     "stereo_sfm.service",
@@ -62,7 +65,7 @@ SHELL_ONLY = {
     "logging",
 }
 LIGHT = ("stereo_sfm/cli.py", "stereo_sfm/__init__.py", "stereo_sfm/errors.py", "stereo_sfm/commands/*.py")
-HEAVY = {"cv2", "numba", "scipy", "gtsam", "rerun", "mcap", "matplotlib", "numpy", "depthai", "usb", "ray"}
+HEAVY = {"cv2", "numba", "scipy", "gtsam", "rerun", "mcap", "matplotlib", "numpy", "depthai", "usb", "ray", "obstore"}
 
 
 def module_name(path: Path, root: Path = ROOT) -> str:

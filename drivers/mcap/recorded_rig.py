@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -45,7 +46,7 @@ class RecordedRig:
         if not all(names):
             raise StereoSfmError(f"{self._name} has no calibration of its images: give one with --rig FILE")
         infos = [self._camera_info(name) for name in names]
-        rectified, label = is_rectified(self._topics.left), self._reader.path.stem
+        rectified, label = is_rectified(self._topics.left), Path(self._reader.path.name).stem
         if len(infos) == 1:
             return Rig(camera_of(infos[0], names[0], rectified), name=label)
         if names[0] == names[1]:

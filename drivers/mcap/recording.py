@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from pathlib import Path
 from typing import Protocol
 
 from stereo_sfm.log.reader import Record, TopicInfo
+from stereo_sfm.storage.remote import Place
 
 
 class Recording(Protocol):
     """Messages by topic and time: an MCAP file (`stereo_sfm.log.reader.LogReader`) or a ROS bag."""
 
-    path: Path
     by_time: bool  # messages come in the order of their log time, else in that of the file, if the kind of file can
+
+    @property
+    def path(self) -> Place:
+        """The file or folder."""
+        ...
 
     @property
     def topics(self) -> list[TopicInfo]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.log.samples import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.pixels import eight_bits
+from stereo_sfm.storage.remote import Place, Remote, place
 from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
 
 if TYPE_CHECKING:
@@ -55,7 +55,8 @@ def open_mcap(path: str, options: McapOptions) -> Source:
     """
     if not path:
         raise StereoSfmError("no file given: use mcap:FILE.mcap")
-    reader = LogReader(Path(path).expanduser())
+    file = place(path)
+    reader = LogReader(file if isinstance(file, Remote) else file.expanduser())
     try:
         if any(t.topic == topics.IMAGE_INFO and t.schema == "stereo_sfm.ImageInfo" for t in reader.topics):
             _refuse_topics(path, options)
@@ -105,7 +106,7 @@ def decode_depth(record: Record) -> F32:
         raise ValueError("a damaged message") from None
 
 
-def check_size(path: Path, what: str, pixels: U8 | F32, size: tuple[int, int]) -> None:
+def check_size(path: Place, what: str, pixels: U8 | F32, size: tuple[int, int]) -> None:
     """Raises StereoSfmError when an image does not match its calibration."""
     height, width = pixels.shape
     if (width, height) != size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import glob
 import sys
 from collections.abc import Iterator, Sequence
@@ -76,10 +77,29 @@ def _results(tasks: Sequence[BatchTask], address: str | None) -> Iterator[tuple[
 
 def _expand(patterns: list[str]) -> list[str]:
     """Expand patterns as a shell does; paths become absolute for other nodes."""
+    from stereo_sfm.storage.remote import is_uri
+
     out: list[str] = []
     for pattern in patterns:
+        if is_uri(pattern):
+            out += _in_bucket(pattern)
+            continue
         found = sorted(glob.glob(pattern))
         if not found and any(c in pattern for c in "*[") and not pattern.startswith("sim:"):
             raise StereoSfmError(f"no recording matches {pattern}: check the folder and the pattern")
         out += [str(Path(f).resolve()) for f in found] or [pattern]
     return out
+
+
+def _in_bucket(pattern: str) -> list[str]:
+    """The objects that a pattern in the last part of an address means; an address without one as it is."""
+    from stereo_sfm.storage import objects
+    from stereo_sfm.storage.remote import Remote
+
+    head, _, last = pattern.rpartition("/")
+    if not any(c in last for c in "*["):
+        return [pattern]
+    names = [name for name, _, _ in objects.listed(Remote.of(head)) if fnmatch.fnmatchcase(name, last)]
+    if not names:
+        raise StereoSfmError(f"no recording matches {pattern}")
+    return [f"{head}/{name}" for name in names]

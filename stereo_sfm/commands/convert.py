@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from stereo_sfm.commands._options import add_source, source_choice, typed
-from stereo_sfm.commands.record import RecordOptions, add_output_arguments, write
+from stereo_sfm.commands.record import RecordOptions, add_output_arguments, to_place
 from stereo_sfm.errors import StereoSfmError
 
 
@@ -18,8 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Convert the whole source."""
     options, choice = typed(RecordOptions, args), source_choice(args)
-    choice.refuse_to_overwrite(options.output)
-    with choice() as source:
-        if source.live:
-            raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {choice.spec}'")
-        return write(source, options, "convert", choice.opening(source.rig))
+    if choice.device:
+        raise StereoSfmError(f"{choice.spec} is a device: use 'stereo-sfm record {choice.spec}'")
+    return to_place(options, choice, "convert")

@@ -28,7 +28,14 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.drivers.registry import recognise
     from stereo_sfm.drivers.source import look_up, path_of
     from stereo_sfm.recording.describe import describe_dataset, describe_file
+    from stereo_sfm.storage.remote import Remote, is_uri, place
 
+    if is_uri(args.source):
+        named = look_up(args.source, args.rig)
+        file = place(named.place)
+        found = describe_file(file, args.rig) if isinstance(file, Remote) else describe_dataset(file, args.rig)
+        print(found.as_json() if args.json else "\n".join(_lines(found)))
+        return 0
     path = path_of(args.source)
     if not path.exists():
         look_up(args.source, args.rig)  # the driver's own check knows more
@@ -73,4 +80,5 @@ def _rate(rate: Rate) -> str:
     if math.isnan(rate.hz):
         return f"{rate.count}"
     gaps = f", {rate.gaps} gaps up to {rate.longest_gap_s:.3f} s" if rate.gaps else ""
-    return f"{rate.count} at {rate.hz:.2f} Hz, jitter {rate.jitter_ms:.2f} ms{gaps}"
+    jitter = "" if math.isnan(rate.jitter_ms) else f", jitter {rate.jitter_ms:.2f} ms"
+    return f"{rate.count} at {rate.hz:.2f} Hz{jitter}{gaps}"

@@ -13,6 +13,7 @@ from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.drivers.source import Source
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.recording.record import Progress
@@ -26,7 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that `record` and `convert` share."""
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.mcap", help="file to write")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="FILE.mcap",
+        help="file to write, also in a bucket: s3://BUCKET/FILE.mcap",
+    )
     parser.add_argument(
         "--image-format",
         choices=("png", "raw", "jpeg"),
@@ -43,7 +50,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 class RecordOptions:
     """Options of `record` and `convert`, as the parser names them."""
 
-    output: Path
+    output: str  # a path, or the address of an object in a bucket
     image_format: str
     overwrite: bool
     quiet: bool
@@ -52,16 +59,33 @@ class RecordOptions:
 def run(args: argparse.Namespace) -> int:
     """Record until the source ends, the duration is over, or Ctrl-C."""
     options, choice = typed(RecordOptions, args), source_choice(args)
-    choice.refuse_to_overwrite(options.output)
+    return to_place(options, choice, "record")
+
+
+def to_place(options: RecordOptions, choice: SourceChoice, mode: str) -> int:
+    """Write a source to a file. One for a bucket is written here first, and stays here until it has arrived."""
+    from stereo_sfm.storage.remote import Remote, place
+
+    target = place(options.output)
+    if not isinstance(target, Remote):
+        choice.refuse_to_overwrite(target)
+        with choice() as source:
+            return write(source, target, options, mode, choice.opening(source.rig))
+    from stereo_sfm.storage.spool import Spool
+
+    spool = Spool.of(target, options.overwrite)
     with choice() as source:
-        return write(source, options, "record", choice.opening(source.rig))
+        code = write(source, spool.file, options, mode, choice.opening(source.rig))
+    spool.send()
+    if not options.quiet:
+        print(f"sent to {target}")
+    return code
 
 
-def write(source: Source, options: RecordOptions, mode: str, opening: Opening | None = None) -> int:
+def write(source: Source, path: Path, options: RecordOptions, mode: str, opening: Opening | None = None) -> int:
     """Write an entered source and print a summary."""
     from stereo_sfm.recording.record import record
 
-    path = options.output
     if path.suffix != ".mcap":
         raise StereoSfmError(f"{path} does not end in .mcap: recordings are MCAP files")
     last: Progress | None = None

@@ -55,6 +55,11 @@ def run(args: argparse.Namespace) -> int:
         print(explain(config), end="")
         return 0
     os.umask(os.umask(0) | OTHERS)
+    if config.map.bucket:
+        from stereo_sfm.fleet.copies import fetch_released
+        from stereo_sfm.storage.remote import Remote
+
+        fetch_released(Remote.of(config.map.bucket), config.map.robot, Path(config.map.folder))
     service = Service(config)
 
     def stop(number: int, frame: FrameType | None) -> None:

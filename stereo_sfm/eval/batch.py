@@ -1,9 +1,8 @@
-"""Many recordings as Ray tasks: each its own inline run in its own folder, resumable, one table of results."""
+"""Many recordings as jobs: each its own inline run in its own folder, resumable, one table of results."""
 
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 import time
@@ -16,13 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.config import Config, dump
-from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.tables import write_table
+from stereo_sfm.jobs import Job, Limits, run_jobs
 
 RESULT = "result.json"
-RETRIES = 3  # of a task whose node died
-# Ray's own switch for a single computer: all its ports are on the loopback address.
-LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 
 
 @dataclass(frozen=True)
@@ -77,7 +74,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
             stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
         result |= {"ok": True, "stats": stats}
     except StereoSfmError as error:
-        result |= {"ok": False, "error": str(error)}
+        result |= {"ok": False, "error": str(error), "kind": type(error).__name__}
     except Exception:
         result |= {"ok": False, "error": traceback.format_exc()}
     folder.mkdir(parents=True, exist_ok=True)
@@ -113,39 +110,12 @@ def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterato
             waiting.append(task)
         else:
             yield task, {**done, "resumed": True}
-    if waiting:
-        yield from _run_on_ray(waiting, address)
-
-
-def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    if address is None:
-        os.environ[LOOPBACK_ONLY] = "0"
-    require(("ray",), "batch", "running many recordings")
-    import ray
-    from ray.exceptions import RayError
-
-    # Always "local": otherwise Ray waits for the last cluster that it knows, even if that is gone.
-    ours = not ray.is_initialized()
-    if ours:
-        ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
-    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_one)
-    pending = {remote.remote(task): task for task in tasks}
-    try:
-        while pending:
-            ready, _ = ray.wait(list(pending), num_returns=1)
-            for reference in ready:
-                task = pending.pop(reference)
-                try:
-                    result = ray.get(reference)
-                except RayError as error:
-                    result = {"recording": task.spec, "ok": False, "error": f"the task died: {error}".splitlines()[0]}
-                yield task, result
-    finally:
-        for reference in pending:
-            ray.cancel(reference, force=True)
-        if ours:
-            ray.shutdown()
+    if not waiting:
+        return
+    of = {task.folder: task for task in waiting}
+    jobs = [Job(task.folder, run_one, (task,)) for task in waiting]
+    for job, result in run_jobs(jobs, Limits(), address, "batch"):
+        yield of[job.name], {"recording": of[job.name].spec, **result}
 
 
 COLUMNS = ("recording", "frames", "tracked %", "keyframes", "loops", "path m", "ATE mm", "frames/s", "result")

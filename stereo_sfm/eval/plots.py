@@ -183,3 +183,24 @@ def plot_stage_times(path: Path, runs: dict[str, dict[str, dict[str, float]]]) -
 def _seconds(record: RunRecord) -> F64:
     stamps = record.frames.stamp_ns
     return (stamps - stamps[0]) / 1e9
+
+
+def plot_trends(path: Path, columns: Sequence[str], rows: Sequence[Sequence[float | str | None]]) -> None:
+    """Numbers of a fleet by night, one panel each.
+
+    Args:
+        path: of the picture. columns: "night" first. rows: one of each night, None for a missing value.
+    """
+    nights = [str(row[0]) for row in rows]
+    figure = Figure(figsize=(9, 2 * (len(columns) - 1)))
+    for k, name in enumerate(columns[1:]):
+        axes = figure.add_subplot(len(columns) - 1, 1, k + 1)
+        values = [np.nan if row[k + 1] is None else float(row[k + 1] or 0.0) for row in rows]
+        axes.plot(range(len(nights)), values, ".-")
+        axes.set_ylabel(name)
+        axes.set_ylim(bottom=0)
+        axes.grid(alpha=0.3)
+        shown = range(0, len(nights), max(len(nights) // 8, 1))
+        axes.set_xticks(list(shown), [nights[i] for i in shown] if k == len(columns) - 2 else ["" for _ in shown])
+    figure.tight_layout()
+    _save(figure, path)

@@ -9,7 +9,6 @@ import struct
 import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
@@ -25,6 +24,8 @@ from stereo_sfm.input_file import open_regular
 from stereo_sfm.log import chunks, scan
 from stereo_sfm.log.chunks import PREFIX
 from stereo_sfm.log.index import tail
+from stereo_sfm.storage.remote import Place, Remote
+from stereo_sfm.storage.stream import RangeStream
 from stereo_sfm.types import I64
 
 log = logging.getLogger("stereo_sfm")
@@ -77,9 +78,12 @@ class _Repaired:
 
 
 class LogReader:
-    """Opens a file, closed or cut off. `truncated` describes its damage, "" if there is none."""
+    """Opens a file, closed or cut off. `truncated` describes its damage, "" if there is none.
 
-    def __init__(self, path: Path) -> None:
+    A file in a bucket is read by ranges: its index, and the chunks of the messages that are asked for.
+    """
+
+    def __init__(self, path: Place) -> None:
         """Open and read the index.
 
         Raises:
@@ -87,12 +91,15 @@ class LogReader:
         """
         self.path = path
         try:
-            self._stream: IO[bytes] = open_regular(path)
+            stream: Any = RangeStream(path) if isinstance(path, Remote) else open_regular(path)
         except OSError as error:
             raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
         self.truncated = ""
         self.by_time = True  # False: messages come in the order of the file, for one whose clock was set back
         self._times: dict[int, I64] | None = None
+        self._stream: IO[bytes] = stream
+        self._distant: RangeStream | None = stream if isinstance(stream, RangeStream) else None
+        self.bytes = self._stream.seek(0, io.SEEK_END)
         try:
             scan.check_magic(self._stream, path)
             self._reader, self.summary = self._open()
@@ -230,13 +237,47 @@ class LogReader:
         indexes = self.summary.chunk_indexes
         if not indexes or any(not c.message_index_offsets for c in indexes):
             return None
-        if self._times is None:
-            try:
-                self._times = self._read_message_indexes()
-            except chunks.DAMAGE as error:
-                raise self._damaged(error) from None
         ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
+        try:
+            if self._distant is not None and not self.truncated:
+                return [times for i in ids if len(times := self._read_channel_index(self._distant, i))]
+            if self._times is None:
+                self._times = self._read_message_indexes()
+        except chunks.DAMAGE as error:
+            raise self._damaged(error) from None
         return [self._times[i] for i in ids if i in self._times]
+
+    @property
+    def distant(self) -> bool:
+        """Whether the file is in a bucket, so that indexes are better not read as a whole."""
+        return self._distant is not None
+
+    def span_ns(self, topic: str) -> tuple[int, int]:
+        """Log times between which a topic has its messages, from the index of the chunks alone; (0, 0) without one."""
+        ids = {c.id for c in self.summary.channels.values() if c.topic == topic}
+        held = [c for c in self.summary.chunk_indexes if not ids.isdisjoint(c.message_index_offsets)]
+        if not held:
+            return 0, 0
+        return min(c.message_start_time for c in held), max(c.message_end_time for c in held)
+
+    def _read_channel_index(self, stream: RangeStream, channel: int) -> I64:
+        """Log times of one channel: of all that lies behind the chunks, only its records are fetched."""
+        wanted: list[tuple[int, int]] = []
+        for chunk in self.summary.chunk_indexes:
+            offsets = chunk.message_index_offsets
+            if channel in offsets:
+                end = chunk.chunk_start_offset + chunk.chunk_length + chunk.message_index_length
+                stop = min((at for at in offsets.values() if at > offsets[channel]), default=end)
+                if not 0 <= offsets[channel] < stop <= self.bytes:
+                    raise ValueError("its index points beyond the end")
+                wanted.append((offsets[channel], stop - offsets[channel]))
+        times = [np.zeros(0, np.int64)]
+        for data in stream.ranges(wanted):
+            _, _, found, size = struct.unpack_from("<BQHI", data)
+            if found != channel:
+                raise ValueError("its index names another channel")
+            times.append(np.frombuffer(data, "<u8", size // 8, struct.calcsize("<BQHI"))[::2].astype(np.int64))
+        return np.concatenate(times)
 
     def _read_message_indexes(self) -> dict[int, I64]:
         """Log times per channel. Behind each chunk lies a record per channel: opcode, length, channel, size, pairs."""

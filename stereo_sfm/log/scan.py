@@ -32,6 +32,7 @@ from mcap.writer import MCAP0_MAGIC
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.chunks import DAMAGE, PREFIX, records
 from stereo_sfm.log.index import Index, Span
+from stereo_sfm.storage.remote import Place
 
 FOOTER_SIZE = PREFIX + 20
 _LAST_OPCODE = 0x0F
@@ -46,7 +47,7 @@ _OF_A_SUMMARY = (
 )
 
 
-def check_magic(stream: IO[bytes], path: Path) -> None:
+def check_magic(stream: IO[bytes], path: Place) -> None:
     """Raises StereoSfmError if the file is not an MCAP file."""
     stream.seek(0)
     start = stream.read(len(MCAP0_MAGIC))

@@ -141,17 +141,21 @@ def write_about(store: Path, about: About) -> None:
     draft.replace(store / ABOUT)
 
 
-def write_version(store: Path, saved: SavedMap, changes: list[str], keep: int = KEPT_VERSIONS) -> int:
+def write_version(
+    store: Path, saved: SavedMap, changes: list[str], keep: int = KEPT_VERSIONS, compress: bool = True
+) -> int:
     """Make this map the newest version of a store, which the caller has locked; the version before is kept.
+
+    `compress` as of `save_map`.
 
     Returns:
         The number of the version.
     """
     with lock_about(store):
-        return _write_version(store, saved, changes, keep)
+        return _write_version(store, saved, changes, keep, compress)
 
 
-def _write_version(store: Path, saved: SavedMap, changes: list[str], keep: int) -> int:
+def _write_version(store: Path, saved: SavedMap, changes: list[str], keep: int, compress: bool) -> int:
     exists = (store / "map.json").exists()
     about = read_about(store) if exists else About(0, find_floor(saved.snapshot))
     if exists:
@@ -160,7 +164,7 @@ def _write_version(store: Path, saved: SavedMap, changes: list[str], keep: int) 
     beside = _extras(store)
     beside[ABOUT] = _about_text(about)
     beside[CHANGES] = "".join(f"{line}\n" for line in changes).encode()
-    save_map(saved, store, beside)
+    save_map(saved, store, beside, compress)
     for number in versions(store)[: -keep or None]:
         shutil.rmtree(versions_folder(store) / f"{number:05d}")
     return about.version

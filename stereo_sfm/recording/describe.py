@@ -24,9 +24,10 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.log import topics
 from stereo_sfm.log.attached import attached_rig
 from stereo_sfm.log.provenance import CONFIG_FILE, ENDED_EARLY, METADATA, TOTALS, config_hash
-from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.reader import LogReader, TopicInfo
 from stereo_sfm.log.recorded import messages
 from stereo_sfm.pixels import DARK
+from stereo_sfm.storage.remote import Place
 from stereo_sfm.types import F64, I64, StereoImage
 
 log = logging.getLogger("stereo_sfm")
@@ -38,6 +39,8 @@ LEAST_CONTRAST = 8  # grey levels between the darkest and the brightest pixel of
 GAP = 1.5  # periods without a frame that count as a gap
 MAX_SKEW_MS = 1.0  # between the cameras, above which tracking degrades
 MAX_JITTER = 0.2  # of the period
+IMAGE_TOPICS = (topics.LEFT_IMAGE, topics.FRAME)  # whose gaps and jitter decide about problems
+FEW = 1000  # messages of a topic in a bucket whose stamps are all read, too
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ def rate_of(stamps: I64) -> Rate:
     return Rate(len(stamps), 1e9 / period, jitter / 1e6, len(wide), longest, missing, int((steps <= 0).sum()))
 
 
-def describe_file(path: Path, rig: Path | None = None) -> Description:
+def describe_file(path: Place, rig: Path | None = None) -> Description:
     """Describe an MCAP file, ours or not; `rig` replaces its calibration or provides a missing one.
 
     Raises:
@@ -106,19 +109,19 @@ def describe_file(path: Path, rig: Path | None = None) -> Description:
     return _with_warnings(out, warned)
 
 
-def _describe_file(path: Path, own_rig: Path | None) -> Description:
+def _describe_file(path: Place, own_rig: Path | None) -> Description:
     with LogReader(path) as reader:
-        stamps = {topic.topic: reader.stamps(topic.topic) for topic in reader.topics}
-        ends = [(int(x[0]), int(x[-1])) for name, x in stamps.items() if name != topics.GROUND_TRUTH and len(x)]
+        rates = {topic.topic: _regularity(reader, topic) for topic in reader.topics}
+        ends = [ends for name, (_, *ends) in rates.items() if name != topics.GROUND_TRUTH and any(ends)]
         seconds = (max(last for _, last in ends) - min(first for first, _ in ends)) / 1e9 if ends else 0.0
         out = Description(
-            str(path), "mcap", seconds, path.stat().st_size, truncated=reader.truncated,
+            str(path), "mcap", seconds, reader.bytes, truncated=reader.truncated,
             metadata=reader.metadata(METADATA),
         )  # fmt: skip
         config = reader.attachment(CONFIG_FILE)
         out.config_sha256 = config_hash(config.decode(errors="replace")) if config is not None else ""
         for topic in reader.topics:
-            out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(stamps[topic.topic])))
+            out.rows.append((topic.topic, topic.schema or topic.encoding, rates[topic.topic][0]))
             out.messages += topic.count
         _describe_infos(out, reader)
         _compare_cameras(out, {topic.topic: topic.count for topic in reader.topics})
@@ -137,8 +140,23 @@ def _describe_file(path: Path, own_rig: Path | None) -> Description:
     if out.truncated:
         out.problems.append(f"{out.truncated} ('stereo-sfm recover' writes a repaired copy)")  # as the reader warns
     if not lean:
-        _describe_source(out, path, own_rig)
+        _describe_source(out, str(path), own_rig)
     return out
+
+
+def _regularity(reader: LogReader, topic: TopicInfo) -> tuple[Rate, int, int]:
+    """Rate of a topic, its first and its last stamp.
+
+    In a bucket only images have every stamp read: those of an IMU are some megabytes of the index.
+    """
+    if reader.distant and topic.topic not in IMAGE_TOPICS and topic.count > FEW:
+        first, last = reader.span_ns(topic.topic)
+        if last > first:
+            nan = float("nan")
+            return Rate(topic.count, (topic.count - 1) * 1e9 / (last - first), nan, 0, 0.0, 0, 0), first, last
+    stamps = reader.stamps(topic.topic)
+    first, last = (int(stamps[0]), int(stamps[-1])) if len(stamps) else (0, 0)
+    return rate_of(stamps), first, last
 
 
 @contextmanager

@@ -33,6 +33,7 @@ class Quota:
     bytes: float
     percent: float = 100.0  # of the disk
     min_free: float = 0.0  # bytes
+    sent_only: bool = False  # what is not in the bucket yet is never deleted
 
     def most(self, disk: Disk) -> float:
         """Bytes that recordings may have."""
@@ -63,27 +64,27 @@ def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[
         root: of the recordings. current: being written, never deleted. disk: how full the disk is.
 
     Returns:
-        Bytes by which the quota is still exceeded: everything else was marked by a person.
+        Bytes by which the quota is still exceeded: everything else was marked by a person, or waits for its upload.
     """
     excess = quota.excess(used_bytes(root), disk(root))
     share = AUTOMATIC_SHARE * quota.most(disk(root))
-    for segment in _in_order(root, share, current) if excess > 0 else ():
+    for segment in _in_order(root, share, current, quota.sent_only) if excess > 0 else ():
         excess -= segment.bytes
         segment.delete()
         if excess <= 0:
             break
-    _free_images(_in_order(root, share, current), quota.lacking(disk(root)))
+    _free_images(_in_order(root, share, current, quota.sent_only), quota.lacking(disk(root)))
     return max(excess, 0.0)
 
 
-def _in_order(root: Path, share: float, current: Segment | None) -> list[Segment]:
+def _in_order(root: Path, share: float, current: Segment | None, sent_only: bool) -> list[Segment]:
     """The segments that may be deleted, first those that go first.
 
-    Args: share, bytes of the newest segments with automatic marks that go last.
+    Args: share, bytes of the newest segments with automatic marks that go last. sent_only: what is in the bucket alone.
     """
     first, last = list[Segment](), list[Segment]()
     for segment in (s for folder in reversed(recordings(root)) for s in reversed(segments(folder))):
-        if segment == current or segment.marked_by_hand:
+        if segment == current or segment.marked_by_hand or (sent_only and not segment.sent):
             continue
         share -= segment.bytes if segment.marked else 0
         (last if segment.marked and share >= 0 else first).append(segment)

@@ -47,6 +47,8 @@ class Policy:
     black_box_s: float
     mark_before_s: float
     mark_after_s: float
+    upload: str = ""  # address of a folder in a bucket; "": recordings stay here
+    upload_bytes_s: float = 0.0  # 0: no limit
 
 
 @dataclass(frozen=True)
@@ -242,7 +244,8 @@ class SegmentRecorder:
             least = f"{p.quota.min_free / 1e6:.0f} MB (recording.min_free_gb)"
             self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {least}"
         elif excess > (0 if current is None else current.bytes):
-            self._no_room = "recordings that you marked fill the quota: delete some of them; images are not recorded"
+            kept = "wait for their upload fill the quota" if p.quota.sent_only else "you marked fill the quota"
+            self._no_room = f"recordings that {kept}: delete some of them; images are not recorded"
         else:
             self._no_room = ""
             if not self._poses.problem:

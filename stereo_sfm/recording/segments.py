@@ -4,6 +4,7 @@
         recording.json                 source, mode and beginning
         00012_000720.mcap              segment 12, from second 720 on: poses, keyframes, map updates, events, thumbnails
         00012_000720.images.mcap       its images with inertial and wheel samples: a recording of its own
+        SHA256SUMS                     of the files that have arrived in a bucket (`recording.upload`)
         00012_000720.marked            kept beyond the quota; a line for each mark, "lost: ..." of the service's own
 
 Each file opens alone; the folder is a source that plays the images of all its segments.
@@ -29,6 +30,8 @@ from stereo_sfm.log.scan import summary_is_whole
 
 KIND = "stereo_sfm_recording"
 POSES, MARKED = ".mcap", ".marked"
+SENT = "SHA256SUMS"  # of a recording: its files that are in a bucket, with their checksums
+SENT_END = b"# complete\n"  # its last line when all are there
 AUTOMATIC = "lost: "  # a mark that begins like this is the service's own
 _FOLDER = re.compile(r"(\d{5,})_[\d_-]+")
 _SEGMENT = re.compile(r"(\d{5,})_(\d{6,})[a-z]?")  # a letter: begun again after the disk refused a file
@@ -80,6 +83,21 @@ class Segment:
         return not lines or not all(line.startswith(AUTOMATIC) for line in lines)
 
     @property
+    def sent_names(self) -> set[str]:
+        """The files of its recording that are in a bucket."""
+        try:
+            lines = (self.folder / SENT).read_text("utf-8", "replace").splitlines()
+        except OSError:
+            return set()
+        return {line.partition("  ")[2] for line in lines}
+
+    @property
+    def sent(self) -> bool:
+        """Whether all of it is in a bucket."""
+        names = self.sent_names
+        return all(path.name in names for path in (self.poses, self.images) if path.exists())
+
+    @property
     def bytes(self) -> int:
         """On disk."""
         return _size(self.poses) + _size(self.images)
@@ -96,9 +114,19 @@ class Segment:
         for path in (self.images, self.poses, self.mark_file):
             path.unlink(missing_ok=True)
         if not segments(self.folder):
-            (self.folder / RECORDING).unlink(missing_ok=True)
+            if not (self.folder / SENT).exists() or sent_whole(self.folder):  # else its checksums are still to be sent
+                for name in (RECORDING, SENT):
+                    (self.folder / name).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it holds other files
                 self.folder.rmdir()
+
+
+def sent_whole(folder: Path) -> bool:
+    """Whether all of a recording is in a bucket, and its checksums with it."""
+    try:
+        return (folder / SENT).read_bytes().endswith(SENT_END)
+    except OSError:
+        return False
 
 
 def _size(path: Path) -> int:

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from stereo_sfm.config import load as load_config
 from stereo_sfm.config import parse_override, read_toml
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.presets import PRESETS, preset
 from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, SecurityConfig
 from stereo_sfm.settings import explained, line, merge, number, path, read, switch, word
+from stereo_sfm.storage.remote import Remote
 
 if TYPE_CHECKING:
     from stereo_sfm.config import Config
@@ -54,6 +55,8 @@ class MapConfig:
         MAP_MODES,
         "Continue the saved map or begin it, localize in it without changing it, begin a new one, or keep none",
     )
+    bucket: str = line("", "Store in a bucket whose released version is fetched at the start, to localize in it")
+    robot: str = line("", "Name of this robot, where versions are released to some robots")
     save_every_min: float = number(
         5.0,
         0.05,
@@ -79,6 +82,10 @@ class RecordingConfig:
     black_box_min: float = number(10.0, 0.05, 1e5, "Minutes of images that a black box keeps")
     mark_before_s: float = number(30.0, 0, 86400, "Seconds before a mark that are kept")
     mark_after_s: float = number(30.0, 0, 86400, "Seconds after a mark that are kept")
+    upload: str = line(
+        "", "Folder in a bucket that recordings are sent to, as s3://BUCKET/ROBOT; empty: they stay here"
+    )
+    upload_mbit: float = number(0.0, 0, 1e5, "Most megabits a second for that; 0: no limit")
     mark_losses: bool = switch(True, "Mark the places where tracking was lost")
 
 
@@ -147,6 +154,12 @@ def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> Robot
     for override in overrides:
         data = merge(data, parse_override(override))
     config = read(RobotConfig(), data, SEE)
+    for name, address in (("recording.upload", config.recording.upload), ("map.bucket", config.map.bucket)):
+        if address:
+            Remote.of(address)
+            require(("obstore",), "fleet", name)
+    if config.map.bucket and config.map.mode != "localize":
+        raise StereoSfmError('map.bucket is for map.mode = "localize": other modes change the map on the robot')
     return config if file is None else _absolute(config, Path(file).expanduser().resolve().parent)
 
 

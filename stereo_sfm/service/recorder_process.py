@@ -13,7 +13,10 @@ from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.watchdog import Heartbeat, HeartbeatThread
 from stereo_sfm.recording.segment_recorder import Policy, RecorderState, SegmentRecorder
 from stereo_sfm.recording.segment_writers import AGAIN_S
+from stereo_sfm.recording.segments import Segment
+from stereo_sfm.recording.upload import Uploader
 from stereo_sfm.service.child import Send, run_child
+from stereo_sfm.storage.remote import Remote
 
 STATE_S = 0.5
 CLOSE_S = 2.0
@@ -81,6 +84,7 @@ class _Body:
         self._next_state_s = self._next_open_s = 0.0
         self._problem = ""
         self._begin: Begin | None = None
+        self._uploader: Uploader | None = None  # goes on between sessions
 
     def take(self, message: object) -> None:
         """Any message from the service."""
@@ -90,10 +94,12 @@ class _Body:
         elif isinstance(message, Begin):
             self.finish()
             self._begin = message
+            self._send_to(message.policy)
             self._open(message)
         elif isinstance(message, Finish):
             self.finish()
         elif isinstance(message, Policy):
+            self._send_to(message)
             if self._recorder is not None:
                 self._recorder.change(message)
         elif isinstance(message, Mark):
@@ -115,6 +121,22 @@ class _Body:
             self._problem = ""
         except OSError as error:
             self._problem = f"cannot record to {begin.policy.root}: {error.strerror}"
+
+    def _send_to(self, policy: Policy) -> None:
+        """Send recordings to the bucket of this policy."""
+        if self._uploader is not None:
+            self._uploader.close()
+        self._uploader = None
+        if policy.upload:
+            black_box = policy.mode == "black_box"
+            self._uploader = Uploader(
+                policy.root, Remote.of(policy.upload), policy.upload_bytes_s, self._current, black_box
+            )
+            self._uploader.start()
+
+    def _current(self) -> Segment | None:
+        recorder = self._recorder
+        return None if recorder is None else recorder.segment
 
     def _image(self, number: int, message: SlotImage) -> None:
         image = None

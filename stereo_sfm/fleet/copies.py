@@ -1,0 +1,166 @@
+"""A version of a store as a map folder on a disk: of a robot, or of a program that makes the next version.
+
+Only what changed since the version on the disk is fetched. The folder is replaced as a whole when every checksum is
+right; until then, and without a network, it is the version it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.fleet.patches import expanded
+from stereo_sfm.fleet.versions import StoredFile, Version, patch_name, read_file, read_version, released
+from stereo_sfm.folder_lock import FolderLock
+from stereo_sfm.maps.replace_folder import recover, replaced_folder
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import cache_root, fetch, sha256
+from stereo_sfm.storage.remote import Remote
+
+log = logging.getLogger("stereo_sfm")
+
+STATE = ".fleet.json"
+START_S = 10.0  # that a robot with a map waits for each answer before it starts with that map
+MOST_STEPS = 30  # versions that a robot may be behind and still take differences: a month of nights
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What a fetch did."""
+
+    version: int
+    before: int  # 0: nothing
+    received: int  # bytes of files; the version's own object and the head are 1 to 20 kB besides
+
+
+def version_of(folder: Path) -> tuple[str, int]:
+    """Name and number of the version in a folder; "" and 0 if it is none."""
+    try:
+        data = json.loads((folder / STATE).read_text("utf-8"))
+        return str(data["version"]), int(data["number"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "", 0
+
+
+def fetch_version(store: Remote, version: Version, folder: Path) -> Fetched:
+    """Make a folder this version of a store. Files that are not of the store's versions stay.
+
+    Raises:
+        StereoSfmError: a file is damaged in the bucket, or cannot be fetched; the folder is as it was.
+    """
+    folder = folder.absolute()
+    recover(folder)
+    name, before = version_of(folder)
+    mine = {p.name: sha256(p) for p in folder.iterdir() if p.is_file()} if folder.is_dir() else {}
+    if name == version.name and all(mine.get(n) == f.sha256 for n, f in version.files.items()):
+        return Fetched(version.number, before, 0)
+    known = read_version(store, name).files.keys() if name else ()
+    received = 0
+    with replaced_folder(folder, frozenset({*version.files, *known, STATE})) as draft:
+        for file_name in version.files:
+            old = (folder / file_name).read_bytes() if file_name in mine else None
+            data, size = _file(store, version, file_name, old)
+            received += size
+            (draft / file_name).write_bytes(data)
+        state = {"store": str(store), "version": version.name, "number": version.number}
+        (draft / STATE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
+    for gone in known - version.files.keys() if name else ():
+        (folder / gone).unlink(missing_ok=True)
+    return Fetched(version.number, before, received)
+
+
+def _file(store: Remote, version: Version, name: str, old: bytes | None) -> tuple[bytes, int]:
+    """The content of a file of a version, and the bytes that were fetched for it."""
+    file = version.files[name]
+    if old is not None:
+        digest = hashlib.sha256(old).hexdigest()
+        steps = _steps(store, version, name, digest, file.stored)
+        data = _patched(store, old, digest, steps) if steps is not None else None
+        if data is not None:
+            return data, sum(step.patched for step in steps or ())
+    return read_file(store, file), file.stored
+
+
+def _steps(store: Remote, version: Version, name: str, have: str, most: int) -> list[StoredFile] | None:
+    """The differences from a file on the disk to that of a version, in order; None where there are none, or where the
+    whole file has fewer bytes (`most`)."""
+    out: list[StoredFile] = []
+    for _ in range(MOST_STEPS):
+        file = version.files.get(name)
+        if file is None:
+            return None
+        if file.sha256 == have:
+            return out[::-1]
+        if not out or out[-1].sha256 != file.sha256:
+            if not file.patched:
+                return None
+            out.append(file)
+            if sum(step.patched for step in out) >= most:
+                return None
+        if file.base == have:
+            return out[::-1]
+        if not version.parent:
+            return None
+        version = read_version(store, version.parent)
+    return None
+
+
+def _patched(store: Remote, data: bytes, have: str, steps: list[StoredFile]) -> bytes | None:
+    """A file after these differences; None where one of them is missing or damaged: the whole file is fetched then."""
+    for step in steps:
+        try:
+            raw = objects.read(store / patch_name(have, step.sha256))
+        except objects.Missing:
+            return None
+        made = expanded(raw, step.bytes, data)
+        if made is None or hashlib.sha256(made).hexdigest() != step.sha256:
+            return None
+        data, have = made, step.sha256
+    return data
+
+
+def fetched_map(remote: Remote, robot: str = "") -> Path:
+    """A map in a bucket as a folder of the cache: a robot's version of a store, or a map folder as it is.
+
+    Without a network it is the version that was fetched last.
+
+    Raises:
+        StereoSfmError: there is no map, or it is damaged.
+    """
+    place = cache_root() / "stores" / hashlib.sha256(str(remote).encode()).hexdigest()[:16] / remote.name
+    try:
+        if objects.exists(remote / "map.json"):
+            return fetch(remote)
+        version = released(remote, robot)
+    except objects.Unreachable:
+        if version_of(place)[0]:
+            log.warning("%s cannot be reached: version %d is used", remote, version_of(place)[1])
+            return place
+        raise
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with FolderLock(place.parent, "another program fetches this map: try again"):
+        fetch_version(remote, version, place)
+    return place
+
+
+def fetch_released(remote: Remote, robot: str, folder: Path) -> None:
+    """Make a folder the version that a robot should have, at the start of its service.
+
+    Where the network is away, or the version is damaged, a folder that has one already stays as it is.
+
+    Raises:
+        StereoSfmError: it has none.
+    """
+    kept = version_of(folder)[1]
+    try:
+        with objects.patience(START_S if kept else objects.PATIENCE_S):
+            found = fetch_version(remote, released(remote, robot), folder)
+        log.info("%s is version %d of %s, %.2f MB fetched", folder, found.version, remote, found.received / 1e6)
+    except StereoSfmError as error:
+        if not kept:
+            raise
+        log.warning("%s: %s stays version %d", error, folder, kept)

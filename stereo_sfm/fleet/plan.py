@@ -1,0 +1,173 @@
+"""`PLAN.toml`: which bucket, which stores, within which limits; and the walks that there are.
+
+    ROOT/STORE/walks/ROBOT/2026-11-25_2200.mcap             a recording
+    ROOT/STORE/walks/ROBOT/00007_2026-11-25_220000/         segments, as the service sends them, or a session's own map
+    ROOT/STORE/map/                                         versions of its map
+    ROOT/STORE/work/                                        sessions' maps and results, one folder a walk
+    ROOT/STORE/catalogue/                                   tables of its nights
+
+All of a store is below one prefix, so that rights can be given by store.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import stereo_sfm
+from stereo_sfm.config import Config, dump, read_toml
+from stereo_sfm.config import load as load_config
+from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.presets import PRESETS, preset
+from stereo_sfm.settings import explained, line, number, path, read, word
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import SUMS
+from stereo_sfm.storage.remote import Remote, is_uri
+
+SEE = "stereo-sfm fleet run --print-plan"
+UNDATED = "undated"
+_NIGHT = re.compile(r"\d{4}-\d\d-\d\d")
+_WHOLE = (SUMS, "map.json")  # one of them in a folder says that all of it has arrived
+
+
+@dataclass(frozen=True)
+class FleetConfig:
+    """Where everything is."""
+
+    root: str = line("", "Folder in a bucket with a folder for each store, as s3://BUCKET")
+    stores: str = line("", "Names of the stores, separated by commas; empty: all there are")
+    keep_images_days: int = number(
+        0, 0, 36500, "Days after which recordings are deleted, for people are in them; 0: never"
+    )
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """What decides poses and maps."""
+
+    config: str = path("Configuration file of `stereo-sfm run -c`")
+    preset: str = word("default", tuple(PRESETS), "Preset that the configuration file refines")
+
+
+@dataclass(frozen=True)
+class JobConfig:
+    """Limits of each walk and of each night of a store."""
+
+    minutes: float = number(60.0, 0, 1e5, "Minutes, after which it counts as failed; 0: no limit")
+    memory_gb: float = number(4.0, 0, 1e4, "Gigabytes of memory that are reserved for it, and the most that it gets")
+    retries: int = number(5, 0, 100, "Tries after its worker or computer died")
+
+
+@dataclass(frozen=True)
+class Walk:
+    """One recording, or the map that a robot made of it."""
+
+    store: str
+    night: str  # YYYY-MM-DD
+    robot: str
+    name: str  # unique in its store
+    source: str  # address in a bucket, or any other source
+    state: str = ""  # tells what was sent from what is sent again under its name
+    bytes: int = 0
+
+    def key(self, config: Config) -> str:
+        """Of its result: another one for other bytes, another configuration, another version of the program."""
+        about = [self.store, self.source, self.state, dump(config), stereo_sfm.__version__]
+        return f"{self.night}_{hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The content of a plan."""
+
+    fleet: FleetConfig = field(default_factory=FleetConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    job: JobConfig = field(default_factory=JobConfig)
+    listed: tuple[Walk, ...] = ()  # walks that the plan names itself
+
+    @property
+    def root(self) -> Remote:
+        return Remote.of(self.fleet.root)
+
+    def config(self) -> Config:
+        """Of all walks.
+
+        Raises:
+            StereoSfmError: its file is invalid.
+        """
+        return load_config(self.tracking.config or None, (), preset(self.tracking.preset))
+
+
+def load_plan(file: Path) -> Plan:
+    """Read a plan. The configuration file's path is relative to the plan's folder.
+
+    Raises:
+        StereoSfmError: it cannot be read, has an unknown key, or names no place.
+    """
+    require(("obstore",), "fleet", "a fleet")
+    data = read_toml(file)
+    walks = data.pop("walk", [])
+    sections = {f.name: data.pop(f.name) for f in dataclasses.fields(Plan) if f.name in data and f.name != "listed"}
+    plan = dataclasses.replace(read(Plan(), {**data, **sections}, SEE), listed=tuple(_listed(file, walks)))
+    if not is_uri(plan.fleet.root):
+        raise StereoSfmError(f'{file} names no place: add [fleet] root = "s3://BUCKET"')
+    Remote.of(plan.fleet.root)
+    if plan.tracking.config:
+        config = str(file.absolute().parent / Path(plan.tracking.config).expanduser())
+        plan = dataclasses.replace(plan, tracking=dataclasses.replace(plan.tracking, config=config))
+    return plan
+
+
+def _listed(file: Path, walks: Any) -> Iterator[Walk]:
+    wanted = {"store", "night", "robot", "source"}
+    for walk in walks if isinstance(walks, list) else [None]:
+        if not isinstance(walk, dict) or walk.keys() != wanted or not all(isinstance(v, str) for v in walk.values()):
+            raise StereoSfmError(f"{file}: each [[walk]] has the texts {', '.join(sorted(wanted))}, and no others")
+        if any("/" in walk[name] or not walk[name] for name in ("store", "night", "robot")):
+            raise StereoSfmError(f"{file}: store, night and robot of a [[walk]] are names without slashes")
+        name = f"{walk['robot']}/{hashlib.sha256(walk['source'].encode()).hexdigest()[:12]}"
+        yield Walk(name=name, **walk)
+
+
+def explain(plan: Plan) -> str:
+    """The plan as TOML, with the description of every setting as a comment above it."""
+    return explained(dataclasses.replace(plan, listed=()))
+
+
+def find_walks(plan: Plan) -> tuple[list[Walk], list[str]]:
+    """All walks of the plan's stores by store, night and name; and those that have not arrived as a whole.
+
+    Raises:
+        StereoSfmError: there is no such bucket, or no right to list it.
+    """
+    wanted = [name.strip() for name in plan.fleet.stores.split(",") if name.strip()]
+    stores = wanted or sorted({*objects.folders(plan.root), *(walk.store for walk in plan.listed)})
+    walks, waiting = [walk for walk in plan.listed if walk.store in stores], list[str]()
+    for store in stores:
+        place = plan.root / store / "walks"
+        found: dict[str, list[tuple[str, int, str]]] = {}
+        for name, size, tag in objects.listed(place):
+            if name.count("/") >= 1 and not name.endswith(".sha256"):
+                found.setdefault("/".join(name.split("/")[:2]), []).append((name, size, tag))
+        for name, files in found.items():
+            is_file = files[0][0] == name
+            if is_file and not name.endswith(".mcap"):
+                continue
+            if not is_file and not any(file.rpartition("/")[2] in _WHOLE for file, _, _ in files):
+                waiting.append(str(place / name))
+                continue
+            night = _NIGHT.search(name.partition("/")[2])
+            state = hashlib.sha256(repr(files).encode()).hexdigest()[:16]
+            walks.append(
+                Walk(
+                    store, night[0] if night else UNDATED, name.partition("/")[0], name, str(place / name), state,
+                    sum(size for _, size, _ in files),
+                )
+            )  # fmt: skip
+    return sorted(walks, key=lambda w: (w.store, w.night, w.name)), waiting

@@ -1,0 +1,109 @@
+"""`fleet report`: what the catalogue says, as text and as one page with plots."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.eval.html_page import take_plots, to_html
+from stereo_sfm.eval.plots import plot_trends
+from stereo_sfm.eval.tables import write_table
+
+OLD_NIGHTS = 3  # without an update, from which on a map counts as old
+DRIFTED_DEG = 0.05  # half of the 0.1 degrees that `benchmarks self_calibration` calls a small error
+
+STORES = """
+WITH nights AS (SELECT DISTINCT night FROM walks),
+     last AS (SELECT store, max(night) FILTER (ok) AS updated FROM walks GROUP BY store),
+     newest AS (SELECT store, max(version) AS version, arg_max(stored, version) AS stored,
+                arg_max(delta, version) AS delta, sum(changes) AS changes FROM versions GROUP BY store)
+SELECT w.store, n.version, l.updated AS "last update",
+       (SELECT count(*) FROM nights WHERE l.updated IS NULL OR night > l.updated) AS "nights ago",
+       count(*) AS walks, count(*) FILTER (NOT ok) AS failed, n.changes, round(n.stored / 1e6, 2) AS "map MB",
+       round(n.delta / 1e6, 2) AS "last delta MB", round(median(w.lost_percent), 2) AS "lost %",
+       round(median(w.drift_percent), 2) AS "drift %"
+FROM walks w LEFT JOIN last l USING (store) LEFT JOIN newest n USING (store)
+GROUP BY w.store, n.version, l.updated, n.changes, n.stored, n.delta ORDER BY "nights ago" DESC, failed DESC, w.store
+"""
+CAMERAS = """
+WITH turned AS (SELECT robot, camera, night, avg(turned_x_deg) AS x, avg(turned_y_deg) AS y, avg(turned_z_deg) AS z
+                FROM walks WHERE turned_x_deg IS NOT NULL GROUP BY robot, camera, night)
+SELECT robot, camera, count(*) AS nights, round(arg_max(x, night), 3) AS "x deg",
+       round(arg_max(y, night), 3) AS "y deg", round(arg_max(z, night), 3) AS "z deg",
+       round(sqrt(pow(arg_max(x, night) - arg_min(x, night), 2) + pow(arg_max(y, night) - arg_min(y, night), 2)
+             + pow(arg_max(z, night) - arg_min(z, night), 2)), 3) AS "turned since the first night, deg"
+FROM turned GROUP BY robot, camera ORDER BY 7 DESC, robot
+"""
+FAILED = "SELECT store, night, robot, walk, why FROM walks WHERE NOT ok ORDER BY night DESC, store, walk"
+CHANGED = "SELECT store, night, version, text FROM changes ORDER BY night DESC, store, text"
+TRENDS = """
+SELECT w.night, count(*) AS walks, count(*) FILTER (NOT ok) AS failed, median(lost_percent) AS lost,
+       median(drift_percent) AS drift, sum(w.cost_s) / 3600 AS hours,
+       (SELECT median(delta) / 1e6 FROM versions v WHERE v.night = w.night) AS delta
+FROM walks w GROUP BY w.night ORDER BY w.night
+"""
+MOST_SHOWN = 50  # rows of a table on the page; the files hold all
+
+
+def report(connection: Any, folder: Path) -> tuple[list[str], Path]:
+    """Write fleet.html, and each table as CSV and Parquet, into a folder.
+
+    Args:
+        connection: of `catalogue.opened`. folder: made if needed.
+
+    Returns:
+        Lines for the screen, and the page.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    tables = {
+        "stores": _table(connection, STORES), "cameras": _table(connection, CAMERAS),
+        "failed": _table(connection, FAILED), "changes": _table(connection, CHANGED),
+        "trends": _table(connection, TRENDS),
+    }  # fmt: skip
+    for name, (columns, rows) in tables.items():
+        write_table(folder / name, columns, rows)
+    lines = summary(tables)
+    titles = {
+        "stores": "Stores", "cameras": "Cameras", "failed": "Walks that are in no map", "changes": "Changed shelves",
+    }  # fmt: skip
+    parts = ["# Fleet", "", *(f"* {line}" for line in lines), "", "## Trends", "", "![trends](trends.png)", ""]
+    for name, title in titles.items():
+        columns, rows = tables[name]
+        parts += [f"## {title}", "", *(_markdown(columns, rows[:MOST_SHOWN]) if rows else ["None."]), ""]
+        if len(rows) > MOST_SHOWN:
+            parts += [f"{len(rows) - MOST_SHOWN} more are in {name}.csv.", ""]
+    with tempfile.TemporaryDirectory() as place:
+        plot_trends(Path(place) / "trends.png", *tables["trends"])
+        plots = take_plots(Path(place), ("trends",))
+    page = folder / "fleet.html"
+    page.write_text(to_html("stereo-sfm fleet", "\n".join(parts), plots), encoding="utf-8")
+    return lines, page
+
+
+def summary(tables: dict[str, tuple[list[str], list[tuple[Any, ...]]]]) -> list[str]:
+    """What somebody should look at, worst first."""
+    stores, cameras, failed = (tables[name][1] for name in ("stores", "cameras", "failed"))
+    nights = tables["trends"][1]
+    walks = sum(row[1] for row in nights)
+    lines = [f"{len(stores)} stores, {len(nights)} nights, {walks} walks, {len(failed)} of them in no map"]
+    old = [f"{row[0]} ({row[3]} nights)" for row in stores if row[3] >= OLD_NIGHTS]
+    lines += [f"maps without an update for {OLD_NIGHTS} nights: {_some(old)}"] if old else []
+    turned = [f"{row[0]} ({row[-1]:.2f} deg)" for row in cameras if row[-1] is not None and row[-1] >= DRIFTED_DEG]
+    lines += [f"robots whose cameras turned: {_some(turned)}"] if turned else []
+    return lines + [f"{row[0]} {row[1]}, {row[3]}: {row[4]}" for row in failed[:10]]
+
+
+def _some(names: Sequence[str], most: int = 10) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _table(connection: Any, query: str) -> tuple[list[str], list[tuple[Any, ...]]]:
+    found = connection.execute(query)
+    return [str(column[0]) for column in found.description], found.fetchall()
+
+
+def _markdown(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
+    shown = [["" if cell is None else str(cell).replace("|", "/") for cell in row] for row in rows]
+    return [f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *shown)]

@@ -1,0 +1,201 @@
+"""The steps of a night, each of which may be repeated: what is done already is found, not done twice.
+
+A walk becomes a session's map and a result, under a name that depends on its bytes, its configuration and the version
+of the program. A night's sessions become one version of the store's map: the exchange of the store's head is the only
+moment at which anything counts, so a worker that is killed before has changed nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.fleet.catalogue import night_tables, walk_row, write_tables
+from stereo_sfm.fleet.editing import Checkout, checked_out, session_id
+from stereo_sfm.fleet.plan import Walk
+from stereo_sfm.fleet.versions import Version, history
+from stereo_sfm.jobs import Result
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import fetch_into, send_folder
+from stereo_sfm.storage.remote import Remote
+
+RESULT = "result.json"
+WRITERS = 10  # tries to write a version while others do
+
+
+def map_walk(root: Remote, walk: Walk, config: Config) -> Result:
+    """A session's own map in the bucket, and the numbers of its run. A failure is kept as well, unless it is one of
+    the network: the same bytes fail again."""
+    place = root / walk.store / "work" / walk.key(config)
+    done = read_json(place / RESULT)
+    if done is not None:
+        return {**done, "resumed": True}
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="walk") as folder:
+        result = _mapped(walk, config, Path(folder))
+        if result["ok"]:
+            result["session_bytes"] = send_folder(Path(result.pop("map")), place / "map")
+            result["session"] = str(place / "map")
+    result["cost_s"] = time.perf_counter() - begin
+    if result.setdefault("lasting", True):
+        objects.write(place / RESULT, json.dumps(result, default=str).encode())
+    return result
+
+
+def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
+    """Of a map: itself, once its checksums are right. Of a source: that of a run."""
+    from stereo_sfm.eval.batch import BatchTask, run_one
+    from stereo_sfm.maps.saved_map import load_map, save_map
+
+    source = walk.source
+    try:
+        if walk.state and not source.endswith(".mcap"):
+            here = folder / "walk"
+            fetch_into(Remote.of(source), here)
+            made = next((p for p in (here, here / "map") if (p / "map.json").is_file()), None)
+            if made is not None:
+                session = load_map(made)
+                save_map(session, folder / "map", compress=False)
+                return _about(session, session_id(session)) | {"ok": True, "map": str(folder / "map"), "stats": None}
+            source = str(here)
+        elif walk.state:
+            with LogReader(Remote.of(source)) as reader:
+                if reader.truncated:
+                    return {"ok": False, "error": f"it is cut off ({reader.truncated}): send it again"}
+    except StereoSfmError as error:
+        return {"ok": False, "error": str(error), "lasting": not isinstance(error, objects.Unreachable)}
+    result = run_one(BatchTask(source, str(folder / "run"), config, True))
+    if not result["ok"]:
+        lasting = result.get("kind") != objects.Unreachable.__name__
+        return {"ok": False, "error": result["error"], "lasting": lasting}
+    try:
+        session = load_map(folder / "run" / "map")
+    except StereoSfmError:
+        return {"ok": False, "error": "nothing was mapped: tracking failed", "stats": result["stats"]}
+    save_map(session, folder / "map", compress=False)
+    about = _about(session, session_id(session))
+    return about | {"ok": True, "map": str(folder / "map"), "stats": result["stats"]}
+
+
+def _about(session: Any, identity: str) -> dict[str, Any]:
+    """What the catalogue says of a session, from its map."""
+    camera = session.cameras[session.session_ids[-1]]
+    return {
+        "id": identity,
+        "keyframes": len(session),
+        "camera": camera.calibrated.serial,
+        "terms": camera.terms.tolist(),
+    }
+
+
+def read_json(remote: Remote) -> dict[str, Any] | None:
+    """The content of a small object; None where there is none, or a damaged one, which is made again."""
+    try:
+        data = json.loads(objects.read(remote))
+    except (objects.Missing, ValueError):
+        return None
+    return data if isinstance(data, dict) else None
+
+
+def update_store(root: Remote, walks: list[Walk], config: Config, results: Mapping[str, Result]) -> Result:
+    """One night of one store: its sessions into the map, plan and shelves, and the tables of the catalogue.
+
+    Args:
+        root: of all stores. walks: of this night, by name. config: of all.
+        results: of `map_walk`, by the name of its job; others are of earlier nights, which are only waited for.
+    """
+    store, night = walks[0].store, walks[0].night
+    marker = root / store / "catalogue" / f"{night}.json"
+    mine = {walk: results[job_name(walk)] for walk in walks}
+    wanted = {walk.name: walk.key(config) for walk in walks}
+    lasting = all(result.get("lasting") for result in mine.values())  # else a walk is tried again next time
+    done = read_json(marker)
+    before: dict[str, Any] = done["rows"] if done is not None else {}
+    if done is not None and all(done["walks"].get(name) == key for name, key in wanted.items()):
+        return {"ok": True, "version": done["version"], "failed": done["failed"], "resumed": True}
+    begin = time.perf_counter()
+    place = root / store / "map"
+    outcomes, version = _put_all(place, mine, config)
+    failed = {walk.name: why for walk, (why, _) in outcomes.items() if why}
+    # Walks whose recordings were deleted since keep their rows.
+    rows = before | {walk.name: walk_row(walk, mine[walk], *outcomes[walk]) for walk in walks}
+    versions = history(place) if version is not None else []
+    tables = night_tables(store, night, [rows[k] for k in sorted(rows)], versions, time.perf_counter() - begin)
+    write_tables(root / store / "catalogue", night, tables)
+    result = {"version": version.number if version else 0, "failed": failed}
+    if lasting:
+        known = done["walks"] if done is not None else {}
+        objects.write(marker, json.dumps({**result, "walks": known | wanted, "rows": rows}).encode())
+    return {"ok": True, **result}
+
+
+def job_name(walk: Walk) -> str:
+    """Of the job that maps a walk."""
+    return f"{walk.store} {walk.night} {walk.name}"
+
+
+Outcomes = dict[Walk, tuple[str, str]]  # why a walk is not in the map, "" if it is; and the checksum of its session
+
+
+def _put_all(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tuple[Outcomes, Version | None]:
+    """The sessions of a night put into the version that counts, as one new version; None: the store has none.
+
+    Where another program is faster, they are put into its version.
+    """
+    for attempt in itertools.count(1):
+        try:
+            return _put_once(place, mine, config)
+        except objects.Changed:
+            if attempt == WRITERS:
+                raise
+    raise AssertionError  # the count does not end
+
+
+def _put_once(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tuple[Outcomes, Version | None]:
+    """Raises Changed if another program was faster."""
+    from stereo_sfm.export.store_plan import write_store_plan
+
+    outcomes: Outcomes = {}
+    with checked_out(place, begin=True) as out:
+        sessions: dict[str, str] = {}
+        changes: list[str] = []
+        for walk, result in mine.items():
+            identity = str(result.get("id", ""))
+            outcomes[walk] = (result["error"].strip().splitlines()[-1] if not result["ok"] else "", identity)
+            if not result["ok"] or identity in sessions:
+                continue
+            held = out.holds(identity)
+            if held:
+                outcomes[walk] = ("" if "already" in held else held, identity)
+                continue
+            try:
+                changes += _put(out, walk, result, config)
+                sessions[identity] = f"{walk.night} {walk.name}"
+            except StereoSfmError as error:
+                if isinstance(error, objects.Unreachable):
+                    raise
+                outcomes[walk] = (str(error), identity)
+        if not sessions:
+            return outcomes, out.version
+        write_store_plan(out.folder)
+        return outcomes, out.publish(sessions, changes)
+
+
+def _put(out: Checkout, walk: Walk, result: Result, config: Config) -> list[str]:
+    from stereo_sfm.maps.put_session import put_session
+    from stereo_sfm.maps.saved_map import load_map
+
+    with tempfile.TemporaryDirectory(prefix="session") as folder:
+        fetch_into(Remote.of(result["session"]), Path(folder) / "map")
+        session = load_map(Path(folder) / "map")
+    if session_id(session) != result["id"]:
+        raise StereoSfmError(f"the session's map of {walk.name} is not what was made: delete {result['session']}")
+    return put_session(out.folder, session, walk.name, config, compress=False).changes

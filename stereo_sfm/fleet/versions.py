@@ -1,0 +1,279 @@
+"""The versions of a store's map in a bucket.
+
+    STORE/head.json                   the version that counts: exchanged on the condition that nobody else did
+    STORE/release.json                the version of each robot; without it all have the head's
+    STORE/versions/00012-5f0c...json  a version: its files, its sessions, its parent; never changed
+    STORE/files/SHA256.zst            a file as a whole
+    STORE/patches/FROM-TO.zst         a file as its differences from the parent's
+
+Two programs that write at the same time both write objects of their own; the exchange of the head decides, and the
+other program learns of it. A version that lost is never read by anybody.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+import secrets
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.fleet.patches import compressed, expanded, patch
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.remote import Remote
+
+HEAD, RELEASE = "head.json", "release.json"
+KIND = "stereo_sfm_store"
+_MANIFEST = re.compile(r"versions/(\d{5,})-[0-9a-f]+\.json")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file of a version."""
+
+    sha256: str
+    bytes: int
+    stored: int  # bytes of the object that holds it as a whole
+    patched: int = 0  # bytes of its differences from the parent's file; 0: there are none
+    base: str = ""  # SHA-256 of the parent's file
+
+
+@dataclass(frozen=True)
+class Version:
+    """A version of a store. Two of them with equal files have equal bits."""
+
+    number: int
+    parent: str  # name of its object, "" of the first
+    files: Mapping[str, StoredFile]
+    sessions: Mapping[str, str]  # checksum of a session's own map -> its name, for all that are in the map
+    changes: tuple[str, ...]
+    software: str
+    by: str  # random: tells two writers apart
+    name: str = field(default="", compare=False)  # of its object
+
+    def text(self) -> bytes:
+        data = {"kind": KIND, **dataclasses.asdict(self)}
+        del data["name"]
+        return (json.dumps(data, indent=1, sort_keys=True) + "\n").encode()
+
+
+@dataclass(frozen=True)
+class Head:
+    """Which version counts."""
+
+    version: str = ""  # name of its object, "": none yet
+    next: int = 1  # number of the version that is made next: numbers are never used again
+    refused: tuple[str, ...] = ()  # sessions of versions that were rolled back: they are not put in again
+    by: str = ""
+    tag: str | None = None  # of the object; None: there is none
+
+    def text(self) -> bytes:
+        data = {"kind": KIND, **dataclasses.asdict(self)}
+        del data["tag"]
+        return (json.dumps(data, indent=1, sort_keys=True) + "\n").encode()
+
+
+def _parsed(remote: Remote, raw: bytes, make: Callable[[dict[str, Any]], T]) -> T:
+    try:
+        data = json.loads(raw)
+        if data.pop("kind") != KIND:
+            raise ValueError
+        return make(data)
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise StereoSfmError(f"{remote} is damaged, or is no store of stereo-sfm") from None
+
+
+def read_head(store: Remote) -> Head:
+    """Of a store; an empty one where there is none."""
+    try:
+        raw, tag = objects.read_tagged(store / HEAD)
+    except objects.Missing:
+        return Head()
+    return _parsed(store / HEAD, raw, lambda d: Head(d["version"], d["next"], tuple(d["refused"]), d["by"], tag))
+
+
+def read_version(store: Remote, name: str) -> Version:
+    """A version by the name of its object.
+
+    Raises:
+        StereoSfmError: there is none, or it is damaged.
+    """
+
+    def make(data: dict[str, Any]) -> Version:
+        files = {key: StoredFile(**file) for key, file in data["files"].items()}
+        fields: dict[str, Any] = {**data, "files": files, "changes": tuple(data["changes"]), "name": name}
+        return Version(**fields)
+
+    return _parsed(store / name, objects.read(store / name), make)
+
+
+def current(store: Remote) -> Version:
+    """The version that counts.
+
+    Raises:
+        StereoSfmError: there is none yet.
+    """
+    head = read_head(store)
+    if not head.version:
+        raise StereoSfmError(f"no map at {store}: 'stereo-sfm map update {store} SESSION' begins one")
+    return read_version(store, head.version)
+
+
+def history(store: Remote) -> list[Version]:
+    """The version that counts and those before it, newest first."""
+    out = [current(store)]
+    while out[-1].parent:
+        out.append(read_version(store, out[-1].parent))
+    return out
+
+
+def numbered(store: Remote, number: int) -> Version:
+    """A version that was the head at some time.
+
+    Raises:
+        StereoSfmError: there is none of this number.
+    """
+    for version in history(store):
+        if version.number == number:
+            return version
+    # Rolled back: the head's history has it no more. Of two writers' versions the one that lost was removed.
+    names = [name for name, _, _ in objects.listed(store) if (m := _MANIFEST.fullmatch(name)) and int(m[1]) == number]
+    if len(names) == 1:
+        return read_version(store, names[0])
+    raise StereoSfmError(f"{store} has no version {number}: 'stereo-sfm map versions {store}' lists them")
+
+
+def publish(
+    store: Remote, folder: Path, head: Head, sessions: Mapping[str, str], changes: list[str], software: str
+) -> Version:
+    """Make the files of a folder the version that counts.
+
+    Args:
+        store: in a bucket. folder: the files. head: as it was when they were begun.
+        sessions: checksum -> name of those in this version that its parent does not have.
+        changes: lines for people. software: that made it.
+
+    Raises:
+        Changed: another program has written a version since `head` was read; this one is not in the store.
+    """
+    before = read_version(store, head.version) if head.version else None
+    files: dict[str, StoredFile] = {}
+    for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
+        old = before.files.get(path.name) if before else None
+        files[path.name] = _stored(store, path.read_bytes(), old)
+    by = secrets.token_hex(8)
+    version = Version(
+        head.next, before.name if before else "", files, {**(before.sessions if before else {}), **sessions},
+        tuple(changes), software, by, f"versions/{head.next:05d}-{by}.json",
+    )  # fmt: skip
+    objects.create(store / version.name, version.text())
+    try:
+        _exchange(store, dataclasses.replace(head, version=version.name, next=head.next + 1, by=by))
+    except objects.Changed:
+        objects.delete([store / version.name])
+        raise
+    return version
+
+
+def _exchange(store: Remote, head: Head) -> None:
+    try:
+        objects.exchange(store / HEAD, head.text(), head.tag)
+    except objects.Changed:
+        raise objects.Changed(f"another program has written a version of {store} meanwhile: run this again") from None
+
+
+def _stored(store: Remote, data: bytes, old: StoredFile | None) -> StoredFile:
+    """Write a file's objects, as far as they are not there. Their names are those of their content."""
+    digest = hashlib.sha256(data).hexdigest()
+    if old is not None and old.sha256 == digest:
+        return old
+    whole = compressed(data)
+    _put(store / whole_name(digest), whole)
+    if old is None:
+        return StoredFile(digest, len(data), len(whole))
+    differences = patch(read_file(store, old), data)
+    if len(differences) >= len(whole):
+        return StoredFile(digest, len(data), len(whole))
+    _put(store / patch_name(old.sha256, digest), differences)
+    return StoredFile(digest, len(data), len(whole), len(differences), old.sha256)
+
+
+def _put(remote: Remote, data: bytes) -> None:
+    """Equal names have equal content, whoever writes it, up to the version of the compression: written once."""
+    if not objects.exists(remote):
+        objects.write(remote, data)
+
+
+def whole_name(digest: str) -> str:
+    return f"files/{digest}.zst"
+
+
+def patch_name(old: str, new: str) -> str:
+    return f"patches/{old}-{new}.zst"
+
+
+def read_file(store: Remote, file: StoredFile) -> bytes:
+    """The content of a file, from the object that holds it as a whole.
+
+    Raises:
+        StereoSfmError: it is not what was written.
+    """
+    remote = store / whole_name(file.sha256)
+    data = expanded(objects.read(remote), file.bytes)
+    if data is None or hashlib.sha256(data).hexdigest() != file.sha256:
+        raise StereoSfmError(f"{remote} is damaged (its checksum is wrong): roll back, or write the version again")
+    return data
+
+
+def roll_back(store: Remote) -> Version:
+    """Let the version before count again. The sessions of the one that counted are not put in again by themselves.
+
+    Raises:
+        StereoSfmError: there is none before. Changed: another program has written meanwhile.
+    """
+    head = read_head(store)
+    now = current(store)
+    if not now.parent:
+        raise StereoSfmError(f"no earlier version of {store} is kept")
+    before = read_version(store, now.parent)
+    refused = sorted({*head.refused, *(now.sessions.keys() - before.sessions.keys())})
+    _exchange(store, dataclasses.replace(head, version=before.name, refused=tuple(refused), by=secrets.token_hex(8)))
+    return before
+
+
+# -- staged roll-out ---------------------------------------------------------------------------------------------
+
+
+def release(store: Remote, number: int, robots: tuple[str, ...] = ()) -> None:
+    """Give a version to some robots, or to all of them.
+
+    Raises:
+        StereoSfmError: there is no such version. Changed: another program has released one meanwhile.
+    """
+    name = numbered(store, number).name
+    given, tag = _released(store)
+    given = {**given, **dict.fromkeys(robots, name)} if robots else {"": name}
+    data = {"kind": KIND, "by": secrets.token_hex(8), "robots": given}
+    objects.exchange(store / RELEASE, (json.dumps(data, indent=1, sort_keys=True) + "\n").encode(), tag)
+
+
+def _released(store: Remote) -> tuple[dict[str, str], str | None]:
+    """Version by robot ("": all others), and the tag of the object."""
+    try:
+        raw, tag = objects.read_tagged(store / RELEASE)
+    except objects.Missing:
+        return {}, None
+    return _parsed(store / RELEASE, raw, lambda d: {str(k): str(v) for k, v in d["robots"].items()}), tag
+
+
+def released(store: Remote, robot: str = "") -> Version:
+    """The version that a robot should have: its own, else that of all, else the one that counts."""
+    given, _ = _released(store)
+    name = given.get(robot, given.get(""))
+    return read_version(store, name) if name else current(store)

@@ -1,0 +1,119 @@
+"""Sends the segments of recordings to a bucket, behind the recorder: slowly, again after a failure, each file once.
+
+The local SHA256SUMS of a recording lists what has arrived. When a recording is over and all of it is up, the file goes
+up as well: a recording in a bucket with a SHA256SUMS is complete.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.recording.segments import RECORDING, SENT, SENT_END, Segment, recordings, segments, sent_whole
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import SUMS, Pace, send_file, sha256
+from stereo_sfm.storage.remote import Remote
+
+log = logging.getLogger("stereo_sfm")
+
+LOOK_S = 2.0  # between two looks for finished segments
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 5.0, 300.0  # after a failure, doubled each time
+
+
+class Uploader:
+    """Sends the recordings of a folder until it is stopped. Several of them on one folder only repeat work."""
+
+    def __init__(
+        self,
+        root: Path,
+        to: Remote,
+        bytes_s: float = 0.0,
+        current: Callable[[], Segment | None] = lambda: None,
+        black_box: bool = False,
+    ) -> None:
+        """Args:
+        root: of the recordings. to: a folder in a bucket. bytes_s: most bytes a second, 0: no limit.
+        current: the segment that is being written, if any.
+        black_box: images are sent of marked segments alone.
+        """
+        self.root, self.to, self._pace, self._current = root, to, Pace(bytes_s), current
+        self._black_box = black_box
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="upload", daemon=True)
+        self.problem = ""
+
+    def start(self) -> None:
+        """In a thread of its own."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; what was being sent is sent again next time."""
+        self._over.set()
+        self._thread.join(2.0)
+
+    def _work(self) -> None:
+        pause_s = FIRST_PAUSE_S
+        while not self._over.is_set():
+            try:
+                self.send_all()
+                self.problem, pause_s = "", FIRST_PAUSE_S
+                self._over.wait(LOOK_S)
+            except InterruptedError:
+                return
+            except (StereoSfmError, OSError) as error:
+                if str(error) != self.problem:
+                    self.problem = str(error)
+                    log.warning("recordings are not sent: %s; they wait in %s", error, self.root)
+                self._over.wait(pause_s)
+                pause_s = min(2 * pause_s, LONGEST_PAUSE_S)
+
+    def send_all(self) -> int:
+        """Send every finished segment that is not up yet, the oldest first.
+
+        Returns:
+            Files that were sent.
+
+        Raises:
+            StereoSfmError: a file cannot be sent; those before it are up.
+        """
+        count = 0
+        for folder in recordings(self.root):
+            current = self._current()
+            for segment in segments(folder):
+                if segment != current:
+                    count += self._send(segment)
+            if (current is None or current.folder != folder) and not sent_whole(folder):
+                self._finish(folder)
+        return count
+
+    def _send(self, segment: Segment) -> int:
+        paths = [segment.poses, segment.images, segment.mark_file]
+        if self._black_box and not segment.marked:
+            paths = [segment.poses]
+        count = 0
+        for path in paths:
+            if path.is_file() and path.name not in segment.sent_names:
+                digest = sha256(path)
+                send_file(path, self.to / path.parent.name / path.name, self._pace, self._over.is_set)
+                with (segment.folder / SENT).open("a", encoding="utf-8") as stream:
+                    stream.write(f"{digest}  {path.name}\n")
+                count += 1
+        return count
+
+    def _finish(self, folder: Path) -> None:
+        """All of a recording is up."""
+        sent = folder / SENT
+        if not sent.is_file():
+            return
+        about = folder / RECORDING
+        if about.is_file():
+            objects.write(self.to / folder.name / RECORDING, about.read_bytes())
+        objects.write(self.to / folder.name / SUMS, sent.read_bytes())
+        sent.write_bytes(sent.read_bytes() + SENT_END)
+        if not segments(folder):  # the quota has removed them meanwhile
+            for path in (about, sent):
+                path.unlink(missing_ok=True)
+            folder.rmdir()

@@ -1,0 +1,286 @@
+"""Objects in buckets: read, write, exchange on a condition, list, delete. Every failure is one line.
+
+Credentials come from where obstore looks for them: the environment (AWS_ACCESS_KEY_ID, GOOGLE_APPLICATION_CREDENTIALS,
+AZURE_STORAGE_ACCOUNT_NAME, ...) or the computer's own role; profiles of AWS need boto3. No message repeats what the
+server or the library says, besides the code of the error: it might contain them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib.util
+import os
+import re
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.folder_lock import FolderLock
+from stereo_sfm.storage.remote import Remote
+
+TRIES = 12  # of a request: a tenth of failing answers makes an object fail once in 10^12
+PATIENCE_S = 180.0  # for all tries of a request: a server that stands still for 20 s costs nothing
+CONNECT_S, REQUEST_S = 5.0, 60.0
+FULL = re.compile(r"QuotaExceeded|StorageFull|InsufficientStorage|\b507\b|No space left|os error 28\b", re.I)
+DENIED = re.compile(r"AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|Forbidden|\b40[13]\b|os error 13\b", re.I)
+NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|The specified bucket does not exist", re.I)
+CODE = re.compile(r"<Code>(\w+)</Code>|\b([45]\d\d [A-Z][A-Za-z ]+)")
+
+
+class Missing(StereoSfmError):
+    """There is no such object."""
+
+
+class Changed(StereoSfmError):
+    """Somebody else has written the object meanwhile."""
+
+
+class Unreachable(StereoSfmError):
+    """The network or the server failed for longer than `PATIENCE_S`."""
+
+
+_patience_s: ContextVar[float] = ContextVar("patience", default=PATIENCE_S)
+
+
+@contextmanager
+def patience(seconds: float) -> Generator[None]:
+    """Give up a request after so long, in this thread and block."""
+    before = _patience_s.set(seconds)
+    try:
+        yield
+    finally:
+        _patience_s.reset(before)
+
+
+@functools.cache
+def _store(scheme: str, bucket: str, patience_s: float) -> Any:
+    require(("obstore",), "fleet", f"{scheme}://")
+    from obstore.store import LocalStore, from_url
+
+    if scheme == "file":
+        return LocalStore(prefix=Path("/"), automatic_cleanup=False, mkdir=True)
+    options: dict[str, Any] = {}
+    if scheme == "s3" and "AWS_ACCESS_KEY_ID" not in os.environ and importlib.util.find_spec("boto3") is not None:
+        from obstore.auth.boto3 import Boto3CredentialProvider
+
+        with contextlib.suppress(ValueError):  # boto3 knows none: the computer's own role is asked for
+            options["credential_provider"] = Boto3CredentialProvider()
+    plain = os.environ.get("AWS_ENDPOINT_URL", "").startswith("http://")
+    client = {"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=REQUEST_S)}
+    options["client_options"] = {**client, **({"allow_http": True} if plain else {})}
+    options["retry_config"] = {
+        "max_retries": TRIES,
+        "retry_timeout": timedelta(seconds=patience_s),
+        "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=10), "base": 2},
+    }
+    return from_url(f"{scheme}://{bucket}", **options)
+
+
+def _of(remote: Remote) -> Any:
+    return _store(remote.scheme, remote.bucket, _patience_s.get())
+
+
+@contextmanager
+def _one_line(remote: Remote, doing: str) -> Generator[None]:
+    """Every error of the library as one of ours."""
+    require(("obstore",), "fleet", f"{remote.scheme}://")
+    from obstore import exceptions as obx
+
+    try:
+        yield
+    except (obx.AlreadyExistsError, obx.PreconditionError):
+        raise Changed(f"{remote} was written by another program meanwhile") from None
+    except (obx.BaseError, OSError, ValueError) as error:
+        raise _named(remote, doing, error, obx) from None
+
+
+def _named(remote: Remote, doing: str, error: BaseException, obx: Any) -> StereoSfmError:
+    said = str(error)
+    if NO_BUCKET.search(said):
+        return StereoSfmError(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
+    if isinstance(error, FileNotFoundError | obx.NotFoundError):
+        return Missing(f"there is no {remote}")
+    denied = (PermissionError, obx.PermissionDeniedError, obx.UnauthenticatedError)
+    if isinstance(error, denied) or DENIED.search(said):
+        return StereoSfmError(
+            f"no right to {doing} {remote}: check the credentials in the environment, and the rights of this prefix"
+        )
+    if FULL.search(said):
+        return StereoSfmError(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
+    if "credential" in said.lower() or "169.254.169.254" in said:
+        return StereoSfmError(f"no credentials for {remote.scheme}://: set them in the environment (AWS_ACCESS_KEY_ID)")
+    code = CODE.search(said)
+    why = (code[1] or code[2]) if code else "no answer"
+    return Unreachable(f"cannot {doing} {remote}: {why}, although it was tried again and again")
+
+
+def read(remote: Remote) -> bytes:
+    """The content of an object.
+
+    Raises:
+        Missing: there is none. StereoSfmError: it cannot be read.
+    """
+    return read_tagged(remote)[0]
+
+
+def read_tagged(remote: Remote) -> tuple[bytes, str]:
+    """The content of an object and the tag of this content."""
+    store = _of(remote)
+    import obstore
+
+    with _one_line(remote, "read"):
+        found = obstore.get(store, remote.key)
+        return bytes(found.bytes()), str(found.meta["e_tag"])
+
+
+def size_and_tag(remote: Remote) -> tuple[int, str]:
+    """Bytes of an object, and the tag of its content.
+
+    Raises:
+        Missing: there is none.
+    """
+    store = _of(remote)
+    import obstore
+
+    with _one_line(remote, "read"):
+        meta = obstore.head(store, remote.key)
+        return int(meta["size"]), str(meta["e_tag"])
+
+
+def exists(remote: Remote) -> bool:
+    """Whether there is an object of this name."""
+    try:
+        size_and_tag(remote)
+    except Missing:
+        return False
+    return True
+
+
+def read_range(remote: Remote, start: int, length: int) -> bytes:
+    """A part of an object."""
+    store = _of(remote)
+    import obstore
+
+    with _one_line(remote, "read"):
+        return bytes(obstore.get_range(store, remote.key, start=start, length=length))
+
+
+def read_ranges(remote: Remote, ranges: Iterable[tuple[int, int]]) -> list[bytes]:
+    """Parts of an object, each (start, length), by requests of their own: nothing between them is read."""
+    wanted = [(start, length) for start, length in ranges if length > 0]
+    if not wanted:
+        return []
+    store = _of(remote)
+    import obstore
+
+    starts, lengths = [start for start, _ in wanted], [length for _, length in wanted]
+    with _one_line(remote, "read"):
+        found = obstore.get_ranges(store, remote.key, starts=starts, lengths=lengths, coalesce=0)
+        return [bytes(part) for part in found]
+
+
+def write(remote: Remote, data: bytes | Path | Iterable[bytes]) -> None:
+    """Write an object whole: nobody sees a part of it."""
+    store = _of(remote)
+    import obstore
+
+    with _one_line(remote, "write"):
+        obstore.put(store, remote.key, data)
+
+
+def create(remote: Remote, data: bytes) -> None:
+    """Write an object that does not exist yet; one with this content already is as good.
+
+    Raises:
+        Changed: there is one with another content.
+    """
+    _conditional(remote, data, None)
+
+
+def exchange(remote: Remote, data: bytes, tag: str | None) -> None:
+    """Replace an object if its content is still the one with this tag; None: if there is none.
+
+    A try whose answer was lost may have succeeded: content that equals `data` counts as written by this call, so it
+    should name its writer.
+
+    Raises:
+        Changed: another program was faster.
+    """
+    _conditional(remote, data, tag)
+
+
+def _conditional(remote: Remote, data: bytes, tag: str | None) -> None:
+    try:
+        if remote.scheme == "file":
+            _exchange_file(remote, data, tag)
+            return
+        store = _of(remote)
+        import obstore
+
+        with _one_line(remote, "write"):
+            obstore.put(store, remote.key, data, mode="create" if tag is None else {"e_tag": tag}, use_multipart=False)
+    except (Changed, Unreachable):
+        with contextlib.suppress(Missing):
+            if read(remote) == data:
+                return
+        raise
+
+
+def _exchange_file(remote: Remote, data: bytes, tag: str | None) -> None:
+    """The same on a file system, which has no such request: under a lock of the folder."""
+    folder = Path("/") / Path(remote.key).parent
+    with _one_line(remote, "write"):
+        folder.mkdir(parents=True, exist_ok=True)
+    try:
+        held = FolderLock(folder, "try again")
+    except StereoSfmError:
+        raise Changed(f"{remote} is being written by another program") from None
+    with held:
+        try:
+            before = size_and_tag(remote)[1]
+        except Missing:
+            before = None
+        if before != tag:
+            raise Changed(f"{remote} was written by another program meanwhile")
+        write(remote, data)
+
+
+def listed(remote: Remote) -> list[tuple[str, int, str]]:
+    """(name below it, bytes, tag) of every object in a folder, by name.
+
+    Raises:
+        StereoSfmError: there is no such bucket, or no right to list it.
+    """
+    store = _of(remote)
+    import obstore
+
+    prefix = f"{remote.key}/" if remote.key else ""
+    with _one_line(remote, "list"):
+        found = [m for page in obstore.list(store, prefix=prefix or None) for m in page]
+    rows = [(str(m["path"]).removeprefix(prefix), int(m["size"]), str(m["e_tag"])) for m in found]
+    return sorted(row for row in rows if row[0])
+
+
+def folders(remote: Remote) -> list[str]:
+    """The names of the folders in a folder."""
+    store = _of(remote)
+    import obstore
+
+    prefix = f"{remote.key}/" if remote.key else ""
+    with _one_line(remote, "list"):
+        found = obstore.list_with_delimiter(store, prefix=prefix or None)["common_prefixes"]
+    return sorted(str(name).rstrip("/").rpartition("/")[2] for name in found)
+
+
+def delete(remotes: Iterable[Remote]) -> None:
+    """Remove objects; those that are gone already are as good."""
+    import obstore
+
+    for remote in remotes:
+        with contextlib.suppress(Missing), _one_line(remote, "delete"):
+            obstore.delete(_of(remote), remote.key)

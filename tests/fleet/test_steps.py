@@ -1,0 +1,166 @@
+"""The steps of a night, one after the other and without Ray: whatever is repeated is done once."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.fleet.catalogue import ask, opened
+from stereo_sfm.fleet.copies import fetch_version
+from stereo_sfm.fleet.plan import Plan, Walk, find_walks, load_plan
+from stereo_sfm.fleet.run import forget_images, jobs_of
+from stereo_sfm.fleet.steps import update_store
+from stereo_sfm.fleet.versions import current, roll_back
+from stereo_sfm.jobs import Job, Result
+from stereo_sfm.maps.put_session import put_session
+from stereo_sfm.maps.saved_map import load_map, save_map
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import send_folder
+from stereo_sfm.storage.remote import Remote
+from tests.maps.maps import same, small_map
+
+STORE = "017"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot's own map of a walk."""
+    folder = tmp_path_factory.mktemp("session") / "map"
+    save_map(small_map()[1], folder)
+    return folder
+
+
+@pytest.fixture
+def plan(place: str, tmp_path: Path) -> Plan:
+    file = tmp_path / "plan.toml"
+    file.write_text(f'[fleet]\nroot = "{place}"\nkeep_images_days = 30\n')
+    return load_plan(file)
+
+
+def carry_out(plan: Plan, only: int | None = None) -> dict[str, Result]:
+    """The jobs in their order; `only` so many of them, as if then everything were killed."""
+    results: dict[str, Result] = {}
+    jobs: list[Job] = jobs_of(plan, find_walks(plan)[0])
+    for job in jobs[:only]:
+        before = {name: results[name] for name in job.after}
+        results[job.name] = job.work(*job.args, before) if before else job.work(*job.args)
+    return results
+
+
+def walks(plan: Plan) -> Remote:
+    return plan.root / STORE / "walks"
+
+
+def test_a_night_is_done_once(plan: Plan, session: Path, tmp_path: Path) -> None:
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    assert len(carry_out(plan, only=1)) == 1  # killed after the first step
+    results = carry_out(plan)
+    night = results[f"{STORE} 2026-11-25"]
+    assert night["version"] == 1 and not night["failed"]
+    assert all(result["resumed"] for result in carry_out(plan).values())
+    assert current(plan.root / STORE / "map").number == 1
+    fetch_version(plan.root / STORE / "map", current(plan.root / STORE / "map"), tmp_path / "robot")
+    put_session(tmp_path / "by_hand", load_map(session), "r1", Config())
+    a, b = load_map(tmp_path / "robot"), load_map(tmp_path / "by_hand")
+    assert same(a.snapshot, b.snapshot) and (tmp_path / "robot" / "floor_plan.pgm").is_file()
+
+
+def test_a_walk_that_is_sent_twice_counts_once(plan: Plan, session: Path) -> None:
+    for name in ("2026-11-25_2200", "2026-11-25_2200_again"):
+        send_folder(session, walks(plan) / "r1" / name)
+    assert not carry_out(plan)[f"{STORE} 2026-11-25"]["failed"]
+    send_folder(session, walks(plan) / "r1" / "2026-11-26_0100")
+    assert not carry_out(plan)[f"{STORE} 2026-11-26"]["failed"]
+    assert len(current(plan.root / STORE / "map").sessions) == 1
+    with opened(plan.root, [STORE]) as connection:
+        assert ask(connection, "SELECT count(*), count(DISTINCT session), max(version) FROM walks")[1] == "3,1,1"
+
+
+def test_a_failed_walk_stops_nothing_and_a_truncated_one_is_taken_when_it_is_whole(plan: Plan, session: Path) -> None:
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    objects.write(walks(plan) / "r2" / "2026-11-25_2200.mcap", b"no recording")
+    cut = walks(plan) / "r3" / "2026-11-25_2200"
+    save_map(small_map(seed=3)[1], session.parent / "third")
+    send_folder(session.parent / "third", cut)
+    whole = objects.read(cut / "points.npz")
+    objects.write(cut / "points.npz", whole[:1000])
+    night = carry_out(plan)[f"{STORE} 2026-11-25"]
+    assert night["version"] == 1 and night["failed"].keys() == {
+        "r2/2026-11-25_2200.mcap", "r3/2026-11-25_2200",
+    }  # fmt: skip
+    assert "is not what was sent" in night["failed"]["r3/2026-11-25_2200"]
+    objects.write(cut / "points.npz", whole)
+    results = carry_out(plan)
+    again = next(result for name, result in results.items() if "r3" in name)
+    assert again["ok"] and not again.get("resumed")
+
+
+def test_what_has_not_arrived_as_a_whole_waits(plan: Plan, session: Path) -> None:
+    objects.write(walks(plan) / "r1" / "00001_2026-11-25_220000" / "00000_000000.images.mcap", b"...")
+    found, waiting = find_walks(plan)
+    assert not found and [w.rpartition("/")[2] for w in waiting] == ["00001_2026-11-25_220000"]
+
+
+def test_a_session_that_was_rolled_back_stays_out(plan: Plan, session: Path) -> None:
+    place = plan.root / STORE / "map"
+    send_folder(session, walks(plan) / "r1" / "2026-11-24_2200")
+    carry_out(plan)
+    from stereo_sfm.fleet.editing import checked_out
+
+    with checked_out(place) as out:
+        out.publish({"bad": "bad"}, ["bad"])
+    assert roll_back(place).number == 1
+    walk = Walk(STORE, "2026-11-25", "r1", "r1/bad", "nowhere", "x")
+    result = {"ok": True, "id": "bad", "lasting": True}
+    name = f"{STORE} 2026-11-25 r1/bad"
+    night = update_store(plan.root, [walk], Config(), {name: result})
+    assert "rolled back" in night["failed"]["r1/bad"] and current(place).sessions.keys().isdisjoint({"bad"})
+
+
+def test_old_recordings_are_deleted_once_their_map_is_made(plan: Plan, session: Path) -> None:
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    found, _ = find_walks(plan)
+    today = datetime.date(2027, 1, 1)
+    assert forget_images(plan, found, today) == 0  # nothing was made of it yet
+    carry_out(plan)
+    assert forget_images(plan, found, datetime.date(2026, 12, 1)) == 0
+    assert forget_images(plan, found, today) > 0 and not find_walks(plan)[0]
+    assert current(plan.root / STORE / "map").number == 1
+    with opened(plan.root, [STORE]) as connection:
+        assert ask(connection, "SELECT count(*) FROM walks")[1] == "1"
+
+
+def test_the_report_names_what_failed(
+    plan: Plan, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    objects.write(walks(plan) / "r2" / "2026-11-26_2200.mcap", b"no recording")
+    carry_out(plan)
+    assert main(["fleet", "report", str(tmp_path / "plan.toml"), "-o", str(tmp_path / "page")]) == 0
+    printed = capsys.readouterr().out
+    assert "1 stores, 2 nights, 2 walks, 1 of them in no map" in printed and "r2/2026-11-26_2200.mcap: " in printed
+    page = (tmp_path / "page" / "fleet.html").read_text()
+    assert "<svg" in page and "r2/2026-11-26_2200.mcap" in page
+    assert (tmp_path / "page" / "stores.parquet").is_file()
+    assert main(["fleet", "report", str(tmp_path / "plan.toml"), "--sql", "SELEC 1"]) == StereoSfmError.exit_code
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "names no place"),
+        ('[fleet]\nroot = "s9://x"', "unknown scheme"),
+        ('[fleet]\nrot = "s3://x"', "did you mean root"),
+        ('[fleet]\nroot = "s3://x"\n[[walk]]\nstore = "a"', r"each \[\[walk\]\] has the texts"),
+    ],
+)
+def test_a_wrong_plan_is_one_line(text: str, said: str, tmp_path: Path) -> None:
+    pytest.importorskip("obstore")
+    (tmp_path / "plan.toml").write_text(text)
+    with pytest.raises(StereoSfmError, match=said):
+        load_plan(tmp_path / "plan.toml")

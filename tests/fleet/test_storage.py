@@ -1,0 +1,141 @@
+"""Places in a bucket: what is written is read, and every failure is one line without a secret."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_folder
+from stereo_sfm.storage.objects import Changed, Missing
+from stereo_sfm.storage.remote import Remote, place
+from stereo_sfm.storage.stream import PAGE, RangeStream
+from tests.fleet.s3_server import READER, Server
+
+
+@pytest.mark.parametrize(
+    ("uri", "text"),
+    [
+        ("s4://bucket/x", "unknown scheme 's4://'"),
+        ("http://host/x", "unknown scheme 'http://'"),
+        ("s3://", "names no bucket"),
+        ("s3://key:secret@bucket/x", "no credentials in an address"),
+        ("file://host/x", "begins with three slashes"),
+    ],
+)
+def test_a_wrong_address_is_one_line(uri: str, text: str) -> None:
+    with pytest.raises(StereoSfmError, match=text) as error:
+        place(uri)
+    assert "secret" not in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_path_stays_a_path() -> None:
+    assert place("a/b") == Path("a/b") and place("file:///a%20b/c") == Path("/a b/c")
+    assert str(Remote.of("s3://bucket/a/") / "b") == "s3://bucket/a/b"
+
+
+def test_failures_are_one_line(place: str, s3: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(Missing, match="there is no s3://"):
+        objects.read(Remote.of(place) / "nothing")
+    with pytest.raises(StereoSfmError, match="there is no bucket s3://absent"):
+        objects.listed(Remote.of("s3://absent/x"))
+    objects.write(Remote.of(place) / "x", b"1")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", READER)
+    objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    assert objects.read(Remote.of(place) / "x") == b"1"
+    with pytest.raises(StereoSfmError, match="no right to write") as error:
+        objects.write(Remote.of(place) / "x", b"2")
+    assert "the-secret" not in str(error.value) and READER not in str(error.value)
+
+
+def test_one_of_many_writers_wins(place: str) -> None:
+    """Ten exchange the same object at the same time, four times."""
+    target, tag = Remote.of(place) / "head", None
+    for turn in range(4):
+        won: list[int] = []
+
+        def write(k: int, tag: str | None = tag, won: list[int] = won, turn: int = turn) -> None:
+            try:
+                objects.exchange(target, f"{turn} {k}".encode(), tag)
+                won.append(k)
+            except Changed:
+                pass
+
+        threads = [threading.Thread(target=write, args=(k,)) for k in range(10)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        raw, tag = objects.read_tagged(target)
+        assert len(won) == 1 and raw == f"{turn} {won[0]}".encode()
+
+
+def test_an_exchange_whose_answer_is_lost_has_happened(place: str, s3: Server) -> None:
+    """The server carries half of the failing requests out: the second try finds the first one's object."""
+    target, tag = Remote.of(place) / "head", None
+    s3.faults(0.4)
+    for k in range(12):
+        objects.exchange(target, f"{k}".encode(), tag)
+        raw, tag = objects.read_tagged(target)
+        assert raw == f"{k}".encode()
+
+
+def test_a_stream_reads_what_is_asked_for(place: str) -> None:
+    data = bytes(k * 7 % 251 for k in range(5 * PAGE + 3))
+    objects.write(Remote.of(place) / "x", data)
+    with RangeStream(Remote.of(place) / "x") as stream:
+        for offset, size in ((3 * PAGE - 5, 10), (0, 3), (len(data) - 4, 100), (PAGE, 2 * PAGE)):
+            stream.seek(offset)
+            assert stream.read(size) == data[offset : offset + size]
+        stream.seek(-4, 2)
+        assert stream.read() == data[-4:]
+        stream.seek(0)
+        assert stream.read() == data and stream.received <= len(data) + 4 * PAGE
+        assert stream.ranges([(1, 2), (PAGE, 3)]) == [data[1:3], data[PAGE : PAGE + 3]]
+
+
+def test_a_folder_comes_back_and_is_sent_once(place: str, tmp_path: Path) -> None:
+    folder, target = tmp_path / "f", Remote.of(place) / "f"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "a").write_bytes(b"1" * 1000)
+    (folder / "sub" / "b").write_bytes(b"2")
+    assert send_folder(folder, target) == 1001 and send_folder(folder, target) == 0
+    (folder / "a").write_bytes(b"3" * 1000)
+    assert send_folder(folder, target) == 1000
+    here = fetch(target)
+    assert (here / "a").read_bytes() == b"3" * 1000 and (here / "sub" / "b").read_bytes() == b"2"
+    assert fetch(target) == here
+
+
+def test_a_truncated_upload_is_found(place: str, tmp_path: Path) -> None:
+    (tmp_path / "f").mkdir()
+    (tmp_path / "f" / "a").write_bytes(b"1" * 1000)
+    target = Remote.of(place) / "f"
+    send_folder(tmp_path / "f", target)
+    objects.write(target / "a", b"1" * 500)
+    with pytest.raises(StereoSfmError, match="a is not what was sent"):
+        fetch(target)
+    assert not [*(tmp_path / "cache").rglob("a")]
+    assert SUMS in [name for name, _, _ in objects.listed(target)]
+
+
+def test_a_pace_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"0" * 30_000)
+    import time
+
+    begin = time.monotonic()
+    assert sum(len(piece) for piece in Pace(100_000).pieces(tmp_path / "x")) == 30_000
+    assert time.monotonic() - begin > 0.15
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["info", "s5://b/x.mcap"], ["run", "s3://absent/x.mcap", "--inline"], ["map", "versions", "s3://absent/store"]],
+)
+def test_commands_say_it_in_one_line(arguments: list[str], s3: Server, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == StereoSfmError.exit_code
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -1,0 +1,173 @@
+"""Versions of a store in a bucket: nothing lost, nothing double, little to fetch, and back to the last good one."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.arrays import write_arrays
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.fleet import copies
+from stereo_sfm.fleet.copies import fetch_version, version_of
+from stereo_sfm.fleet.editing import checked_out
+from stereo_sfm.fleet.versions import (
+    current,
+    history,
+    numbered,
+    patch_name,
+    publish,
+    read_head,
+    release,
+    released,
+    roll_back,
+)
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.objects import Changed, Unreachable
+from stereo_sfm.storage.remote import Remote
+from tests.fleet.s3_server import Server
+
+ROWS = 20_000
+
+
+def write_night(folder: Path, night: int) -> None:
+    """A map's tables, of which a tenth of the rows are other ones each night; 1.3 MB."""
+    folder.mkdir(exist_ok=True)
+    rows = np.random.default_rng(0).integers(0, 256, (ROWS, 64), np.uint8)
+    for k in range(1, night + 1):
+        part = slice(ROWS // 10 * (k - 1), ROWS // 10 * k)
+        rows[part] = np.random.default_rng(k).integers(0, 256, (ROWS // 10, 64), np.uint8)
+        rows = rows[k:]  # rows before are forgotten: all others have another place
+    write_arrays(folder / "observations.npz", {"descriptors": rows}, compress=False)
+    (folder / "map.json").write_text(json.dumps({"night": night}))
+
+
+def publish_night(store: Remote, folder: Path, night: int) -> None:
+    write_night(folder, night)
+    publish(store, folder, read_head(store), {f"session{night}": f"night {night}"}, [f"night {night}"], "test")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name != copies.STATE}
+
+
+def test_a_robot_fetches_what_has_changed(place: str, tmp_path: Path) -> None:
+    store, made, robot = Remote.of(place), tmp_path / "made", tmp_path / "robot"
+    publish_night(store, made, 0)
+    first = fetch_version(store, current(store), robot)
+    assert content(robot) == content(made) and first.received > 1_000_000
+    publish_night(store, made, 1)
+    night = fetch_version(store, current(store), robot)
+    assert content(robot) == content(made) and night.received < 0.15 * first.received
+    assert fetch_version(store, current(store), robot).received == 0
+    for k in (2, 3, 4):
+        publish_night(store, made, k)
+    late = fetch_version(store, current(store), robot)  # offline for three nights
+    assert content(robot) == content(made) and late.received < 0.45 * first.received
+    assert version_of(robot)[1] == 5 and [v.number for v in history(store)] == [5, 4, 3, 2, 1]
+
+
+def test_a_second_writer_is_refused_and_writes_nothing(place: str, tmp_path: Path) -> None:
+    store = Remote.of(place)
+    publish_night(store, tmp_path / "made", 0)
+    outcomes: list[str] = []
+
+    def write(k: int) -> None:
+        try:
+            with checked_out(store) as out:
+                (out.folder / "map.json").write_text(f"{k}")
+                barrier.wait()
+                out.publish({f"of {k}": f"{k}"}, [])
+            outcomes.append("written")
+        except Changed as error:
+            outcomes.append("refused" if "run this again" in str(error) else str(error))
+
+    for turn in range(3):
+        barrier = threading.Barrier(2)
+        threads = [threading.Thread(target=write, args=(2 * turn + k,)) for k in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert sorted(outcomes) == ["refused"] * 3 + ["written"] * 3
+    assert len(current(store).sessions) == 4 and current(store).number == 4
+    assert len([name for name, _, _ in objects.listed(store / "versions")]) == 4
+
+
+def test_damage_in_the_bucket_leaves_the_robot_as_it_was(place: str, tmp_path: Path) -> None:
+    store, made, robot = Remote.of(place), tmp_path / "made", tmp_path / "robot"
+    publish_night(store, made, 0)
+    fetch_version(store, current(store), robot)
+    before, old = content(robot), current(store).files["observations.npz"]
+    publish_night(store, made, 1)
+    new = current(store).files["observations.npz"]
+    patch = store / patch_name(old.sha256, new.sha256)
+    objects.write(patch, objects.read(patch)[:-100])
+    assert fetch_version(store, current(store), robot).received > 1_000_000  # the whole file instead
+    assert content(robot) == content(made)
+    roll_back(store)
+    fetch_version(store, current(store), robot)
+    assert content(robot) == before
+    whole = store / f"files/{new.sha256}.zst"
+    objects.write(whole, objects.read(whole)[:-100])
+    with pytest.raises(StereoSfmError, match="is damaged"):
+        fetch_version(store, numbered(store, 2), robot)
+    assert content(robot) == before and version_of(robot)[1] == 1
+
+
+def test_a_rolled_back_session_is_not_put_in_again(place: str, tmp_path: Path) -> None:
+    store = Remote.of(place)
+    for night in (0, 1):
+        publish_night(store, tmp_path / "made", night)
+    assert roll_back(store).number == 1
+    with checked_out(store) as out:
+        assert out.holds("session0") == "it is in the map already"
+        assert "rolled back" in out.holds("session1") and not out.holds("session2")
+    publish_night(store, tmp_path / "made", 2)
+    assert current(store).number == 3 and current(store).sessions.keys() == {"session0", "session2"}
+    roll_back(store)
+    with pytest.raises(StereoSfmError, match="no earlier version"):
+        roll_back(store)
+
+
+def test_a_version_is_released_to_some_robots_first(place: str, tmp_path: Path) -> None:
+    store = Remote.of(place)
+    for night in (0, 1, 2):
+        publish_night(store, tmp_path / "made", night)
+    assert released(store, "r1").number == 3
+    release(store, 1)
+    release(store, 3, ("r7", "r8"))
+    assert [released(store, robot).number for robot in ("r1", "r7", "r8", "")] == [1, 3, 3, 1]
+    release(store, 2)
+    assert released(store, "r7").number == 2  # all robots means all
+    with pytest.raises(StereoSfmError, match="has no version 9"):
+        release(store, 9)
+
+
+def test_without_a_network_a_robot_keeps_its_version(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from stereo_sfm.cli import main
+
+    publish_night(Remote.of(place), tmp_path / "made", 0)
+    assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
+    before = content(tmp_path / "robot")
+
+    def away(remote: Remote) -> None:
+        raise Unreachable(f"cannot read {remote}: no answer after 12 tries")
+
+    monkeypatch.setattr(objects, "read_tagged", away)
+    assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
+    assert "stays version 1" in capsys.readouterr().err and content(tmp_path / "robot") == before
+    assert main(["map", "fetch", place, str(tmp_path / "other")]) == StereoSfmError.exit_code
+
+
+def test_what_is_no_store_is_one_line(place: str, s3: Server) -> None:
+    with pytest.raises(StereoSfmError, match="no map at"):
+        current(Remote.of(place))
+    objects.write(Remote.of(place) / "head.json", b"{}")
+    with pytest.raises(StereoSfmError, match="is no store"):
+        read_head(Remote.of(place))
