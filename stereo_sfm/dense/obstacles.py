@@ -19,7 +19,7 @@ HEIGHT_SIGMA_M = 0.03  # of the mounted height: tyres, suspension, a measuring t
 UNEVEN_M = 0.01  # of a floor
 FLOOR_SAMPLES = 8000  # points that the floor's plane is fitted to: more cost time and tell nothing
 ROUNDS = 4  # of the robust plane: its weights settle in three
-FEW = 100  # points from which a height of the floor can be told
+FEW = 100  # points from which a height of the floor is known
 CLEAR_SIGMAS = 2.0  # by which a point must be above the least height: noise of the floor is no obstacle
 G_SHARE = 0.1  # an accelerometer that shows more or less than g by this does not show gravity alone
 
@@ -85,7 +85,7 @@ def _floor(h: F64, spread: F64, sides: F64) -> F64:
         scale = unsure if k == 0 else noise  # the first plane may be off by all that is unknown
         weight = 1 / (1 + np.square(h - sides @ plane) / scale) ** 2 / noise
         plane = np.linalg.solve(sides.T @ (sides * weight[:, None]) + prior, sides.T @ (weight * h))
-    return plane
+    return np.asarray(plane, float)
 
 
 def _thinned(points: F32, reach: float) -> F32:
