@@ -48,6 +48,7 @@ NEEDS = {
     "webcam:0": "two webcams",
     "sources webcam|webcam:left": "the example installed: tests/drivers/test_plugin.py does both",
     "--target aprilgrid": "pictures of an AprilGrid: tests/calib/test_calibrate.py runs it on EuRoC's",
+    "://BUCKET|^stereo-sfm fleet ": "a bucket: tests/fleet has a server of its own",
     "^curl": "a running service: tests/service/test_page.py sends it",
 }
 SLOW = ("tutorial.md", "tasks/batch.md", "tasks/dense.md", "tasks/saved-maps.md", "tasks/masks.md", "ablation.md",
@@ -164,7 +165,7 @@ def test_only_hardware_networks_and_other_programs_are_needed() -> None:
     lines = [line for page in WITH_COMMANDS.values() for line in page]
     assert all(any(re.search(pattern, line) for line in lines) for pattern in NEEDS)
     assert set(WITH_COMMANDS) - set(RUN) == {"README.md", "CONTRIBUTING.md", "packaging/ros2/README.md", "drivers.md",
-                                               "tasks/service-outputs.md"}  # fmt: skip
+                                               "tasks/fleet.md", "tasks/service-outputs.md"}  # fmt: skip
 
 
 def test_the_service_takes_every_block_of_settings(shop: Path) -> None:

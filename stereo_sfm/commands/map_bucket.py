@@ -8,6 +8,7 @@ from pathlib import Path
 
 from stereo_sfm.commands import map_store
 from stereo_sfm.commands._options import load_config, typed
+from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.storage.remote import Remote
 
@@ -15,7 +16,7 @@ from stereo_sfm.storage.remote import Remote
 def run(store: Remote, args: argparse.Namespace) -> int:
     """Run the chosen action."""
     if args.action == "update":
-        return _update(store, args)
+        return _update(store, args.walks, load_config(args))
     if args.action == "undo":
         from stereo_sfm.fleet.versions import roll_back
 
@@ -43,12 +44,11 @@ def run(store: Remote, args: argparse.Namespace) -> int:
     return 0
 
 
-def _update(store: Remote, args: argparse.Namespace) -> int:
+def _update(store: Remote, walks: list[str], config: Config) -> int:
     from stereo_sfm.fleet.editing import checked_out, session_id
     from stereo_sfm.maps.put_session import put_session
 
-    config = load_config(args)
-    for name in args.walks:
+    for name in walks:
         session = map_store.mapped(name, config)
         identity = session_id(session)
         with checked_out(store, begin=True) as out:

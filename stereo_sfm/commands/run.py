@@ -58,53 +58,64 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run, write the output folder, print the closing summary. One for a bucket is written here, then sent."""
+    from stereo_sfm.commands._execute import RunOptions, execute
+    from stereo_sfm.maps.folders import MapFolders
+    from stereo_sfm.storage import objects
     from stereo_sfm.storage.folders import send_folder
     from stereo_sfm.storage.remote import Remote, place
 
     target = None if args.output is None else place(args.output)
-    if not isinstance(target, Remote):
-        return _run(args, target)[0]
-    from stereo_sfm.storage import objects
+    folders = MapFolders(_map_to_read(args.map_in), args.localize_only, _map_to_write(args.map_out))
+    folders.check(args.overwrite)
+    with tempfile.TemporaryDirectory(prefix="run") as scratch:
+        if isinstance(target, Remote):
+            objects.listed(target)  # a bucket that is not there is found before anything is computed
+        options = RunOptions(
+            source_choice(args, args.realtime, args.speed, args.camera_store),
+            load_config(args),
+            wiring_of(args),
+            folders,
+            output=Path(scratch) / target.name if isinstance(target, Remote) else target,
+            overwrite=args.overwrite,
+            frame=args.frame,
+            max_lost_percent=args.max_lost,
+            matches=args.matches,
+            quiet=args.quiet,
+            verbose=args.verbose,
+        )
+        code, written = execute(options)
+        if args.open:
+            from stereo_sfm.commands._browser import show
 
-    objects.listed(target)  # a bucket that is not there is found before anything is computed
-    with tempfile.TemporaryDirectory(prefix="run") as folder:
-        code, written = _run(args, Path(folder) / target.name)
-        size = send_folder(written, target)
-    if not args.quiet:
-        print(f"sent to {target}: {size / 1e6:.1f} MB")
+            show(written / "report.html")
+        if isinstance(target, Remote):
+            size = send_folder(written, target)
+            if not args.quiet:
+                print(f"sent to {target}: {size / 1e6:.1f} MB")
     return code
 
 
-def _run(args: argparse.Namespace, output: Path | None) -> tuple[int, Path]:
-    from stereo_sfm.commands._execute import RunOptions, execute
-    from stereo_sfm.maps.folders import MapFolders
+def _map_to_read(name: str | None) -> Path | None:
+    """The folder of `--map-in`; one in a bucket is fetched."""
     from stereo_sfm.storage.remote import Remote, place
 
-    map_in, map_out = (None if name is None else place(name) for name in (args.map_in, args.map_out))
-    if isinstance(map_in, Remote):
+    found = None if name is None else place(name)
+    if isinstance(found, Remote):
         from stereo_sfm.fleet.copies import fetched_map
 
-        map_in = fetched_map(map_in)
-    if isinstance(map_out, Remote):
-        raise StereoSfmError(f"--map-out is a folder here; 'stereo-sfm map update {map_out} RUN' changes that store")
-    folders = MapFolders(map_in, args.localize_only, map_out)
-    folders.check(args.overwrite)
-    options = RunOptions(
-        source_choice(args, args.realtime, args.speed, args.camera_store),
-        load_config(args),
-        wiring_of(args),
-        folders,
-        output=output,
-        overwrite=args.overwrite,
-        frame=args.frame,
-        max_lost_percent=args.max_lost,
-        matches=args.matches,
-        quiet=args.quiet,
-        verbose=args.verbose,
-    )
-    code, folder = execute(options)
-    if args.open:
-        from stereo_sfm.commands._browser import show
+        return fetched_map(found)
+    return found
 
-        show(folder / "report.html")
-    return code, folder
+
+def _map_to_write(name: str | None) -> Path | None:
+    """The folder of `--map-out`.
+
+    Raises:
+        StereoSfmError: it is in a bucket.
+    """
+    from stereo_sfm.storage.remote import Remote, place
+
+    found = None if name is None else place(name)
+    if isinstance(found, Remote):
+        raise StereoSfmError(f"--map-out is a folder here; 'stereo-sfm map update {found} RUN' changes that store")
+    return found

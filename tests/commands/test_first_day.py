@@ -141,7 +141,7 @@ def test_ablation_of_a_source_without_truth_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["ablation", f"images:{folder}", "-o", str(tmp_path / "a")]) == 2
-    assert "has no ground truth to evaluate the cells against" in capsys.readouterr().err
+    assert "has no ground truth to compare with" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["pairs2", "pirs", "runs/pairs2", "camera"])

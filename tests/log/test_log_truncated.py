@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 import os
 import resource
@@ -276,9 +275,9 @@ def test_an_interrupted_recording_is_closed(
     source = _Interrupted(fisheye_rig(), stereo_images(30, np.random.default_rng(1)))
     source.number = number
     path = tmp_path / "a.mcap"
-    options = argparse.Namespace(output=path, image_format="png", overwrite=True, quiet=False)
+    options = record_command.RecordOptions(str(path), "png", overwrite=True, quiet=False)
     for source.live, code in ((False, 130), (True, 0)):
-        assert record_command.write(source, options, "record") == code
+        assert record_command.write(source, path, options, "record") == code
         assert "11 frames" in capsys.readouterr().out
         with LogReader(path) as reader:
             assert reader.truncated == ""

@@ -164,7 +164,8 @@ def test_a_killed_stage_ends_the_run_and_leaves_a_log(stage: str, tmp_path: Path
                 if killed := on_disk >= 25:
                     os.kill(pids[stage], signal.SIGKILL)
     assert killed
-    assert not any(psutil.pid_exists(pid) for pid in pids.values())
+    left = [psutil.Process(pid) for pid in pids.values() if psutil.pid_exists(pid)]
+    assert not psutil.wait_procs(left, timeout=10)[1]  # nobody waits for the killed one
     with pytest.raises(FileNotFoundError):
         shared_memory.SharedMemory(name)
     with LogReader(path) as reader:

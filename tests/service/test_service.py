@@ -97,8 +97,9 @@ def test_a_source_that_cannot_be_opened_ends_it_with_one_line(tmp_path: Path) ->
         Service(settings)
     nothing = config(tmp_path, "localize")
     states = list[Status]()
-    with Service(nothing, MadeSource.of(endless_wall)) as service:
-        service.on(Status, states.append)
+    service = Service(nothing, MadeSource.of(endless_wall))
+    service.on(Status, states.append)
+    with service:
         assert service.wait(PATIENCE_S)
     assert "no map at" in str(service.error)
     assert states[-1].state == ServiceState.STOPPING and "no map at" in states[-1].reason

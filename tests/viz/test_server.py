@@ -78,7 +78,9 @@ def test_the_viewer_of_this_interpreter_is_found(monkeypatch: pytest.MonkeyPatch
 
 def test_a_viewer_that_ends_at_once_is_one_line(ports: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "_executable", lambda: "false")
-    with pytest.raises(StereoSfmError, match=r"^cannot open the viewer: rerun ended with exit code 1$"):
+    with pytest.raises(
+        StereoSfmError, match=r"^cannot open the viewer: rerun ended with exit code 1; try --viz serve or save$"
+    ):
         server.open_window()
 
 
