@@ -41,6 +41,7 @@ def measured(folder: Path, sequence: Sequence, truth: Trajectory | None) -> dict
         "loops": stats["loops_accepted"],
         "corrections": sum(c["why"] != "step" for c in changes),
         "steps": sum(c["why"] == "step" for c in changes),
+        "not_ok": stats["frames"] - stats["states"].get("OK", 0) if "states" in stats else None,
         "suspected": len(stats["suspected"]) if "suspected" in stats else None,  # earlier versions did not tell
         "changes": [{name: c[name] for name in KEPT} for c in told],
         "duration_s": stats["duration_s"],

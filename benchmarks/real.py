@@ -169,7 +169,7 @@ def result_of(job: Job, place: Path, rig: Path | None) -> dict[str, Any]:
 
 def idle(switch: str, default: dict[str, Any]) -> bool:
     """Whether what a switch turns off did nothing in the default run (a result): the run without it is the same."""
-    nothing = {"recovery": default.get("lost"), "steps": default.get("suspected")}
+    nothing = {"recovery": default.get("not_ok"), "steps": default.get("suspected")}
     return not default["error"] and nothing.get(switch, 1) == 0
 
 

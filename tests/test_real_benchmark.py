@@ -60,6 +60,15 @@ def test_a_switch_that_is_clearly_better_is_told(modules: dict[str, ModuleType])
     assert better not in comparison(default, [run(k, 1.1 + 0.5 * k) for k in range(5)])
 
 
+def test_only_what_did_nothing_is_idle(modules: dict[str, ModuleType]) -> None:
+    """A camera that recovers within an image, or that sensors bridge, is never lost, but was searched for."""
+    del modules
+    idle = importlib.import_module("real").idle
+    assert idle("recovery", run(0, 1.0, not_ok=0)) and not idle("recovery", run(0, 1.0, not_ok=1, lost=0))
+    assert idle("steps", run(0, 1.0, suspected=0)) and not idle("steps", run(0, 1.0, suspected=1))
+    assert not idle("recovery", run(0, 1.0, not_ok=None)) and not idle("people", run(0, 1.0, not_ok=0, suspected=0))
+
+
 def test_a_run_without_a_pose_is_as_bad_as_a_camera_that_stands_still(modules: dict[str, ModuleType]) -> None:
     comparison, better = modules["_real_table"].comparison, modules["_real_table"].BETTER
     default = [run(k, None, lost=100) for k in range(5)]

@@ -21,7 +21,7 @@ CORRECTED = "rig_corrected.yaml"
 
 def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
     """Every change of the rig as plain values; terms in degrees and, of the focal length, per cent."""
-    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    first_ns = record.frames.begin_ns
     return [
         {
             "kf_id": c.kf_id,
@@ -39,7 +39,7 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
 
 def suspicion_stats(record: RunRecord) -> list[dict[str, Any]]:
     """Each sudden rotation of the right camera that was suspected, and each that did not stay."""
-    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    first_ns = record.frames.begin_ns
     news = [(stamp_ns, text) for stamp_ns, text in record.news if text.startswith(SUSPECTED)]
     return [{"seconds": (stamp_ns - first_ns) * 1e-9, "text": text} for stamp_ns, text in news]
 
@@ -55,7 +55,7 @@ def sensor_stats(record: RunRecord) -> list[dict[str, Any]] | None:
     where it was not asked for."""
     if not record.calibrates_sensors:
         return None
-    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    first_ns = record.frames.begin_ns
     return [
         {
             "kf_id": u.kf_id,

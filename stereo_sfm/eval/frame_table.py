@@ -71,6 +71,11 @@ class FrameTable(SpooledColumns):
         """(F,) whether the frame has a pose of its own."""
         return np.isin(self.state, TRACKED)
 
+    @property
+    def begin_ns(self) -> int:
+        """Stamp of the first frame; 0 without one."""
+        return int(self.stamp_ns[0]) if len(self) else 0
+
     def reasons_of(self, rows: Bool | I64) -> list[str]:
         """Why there is no pose, of these rows."""
         return [self.reasons[k] for k in self.reason_id[rows].tolist()]

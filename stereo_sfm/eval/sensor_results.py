@@ -16,7 +16,7 @@ UNDECIDED = {
 
 def sensor_use_stats(record: RunRecord) -> dict[str, dict[str, Any]]:
     """By sensor of the calibration: how far it counted at the end, and since when and why it is left out."""
-    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    first_ns = record.frames.begin_ns
     out: dict[str, dict[str, Any]] = {}
     for name, code in record.sensor_use.items():
         out[name] = {"use": SensorUse(code).name.lower(), "seconds": None, "why": ""}

@@ -36,6 +36,14 @@ def test_many_frames_keep_their_values() -> None:
     assert table.reasons_of(np.array([1, 2, 3, 299])) == ["dark", "blur", "", "blur"]
 
 
+def test_the_first_stamp_is_the_beginning() -> None:
+    table = FrameTable()
+    assert table.begin_ns == 0
+    for k in (7, 8):
+        table.add(Frame(k, 10 * k, np.eye(4), np.eye(6), OK, "", SEEN, 0, np.eye(4)))
+    assert table.begin_ns == 70
+
+
 def filled(count: int) -> FrameTable:
     table = FrameTable()
     for k in range(count):
