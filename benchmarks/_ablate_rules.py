@@ -35,20 +35,20 @@ RULES = (
     _rule(
         "motion of long-static points",
         SOLVER,
-        "found = [agreed, by_settled, other, by_near]",
+        "found = [agreed, by_static, other, by_near]",
         "found = [agreed, other, by_near]",
     ),
     _rule(
         "motion of points near the prediction",
         SOLVER,
-        "found = [agreed, by_settled, other, by_near]",
-        "found = [agreed, by_settled, other]",
+        "found = [agreed, by_static, other, by_near]",
+        "found = [agreed, by_static, other]",
     ),
     _rule(
         "motion of the rest",
         SOLVER,
-        "found = [agreed, by_settled, other, by_near]",
-        "found = [agreed, by_settled, by_near]",
+        "found = [agreed, by_static, other, by_near]",
+        "found = [agreed, by_static, by_near]",
     ),
     _rule(
         "unusual motion is doubted",
@@ -65,7 +65,7 @@ RULES = (
     _rule(
         "consistent points",
         SOLVER,
-        'return best if undivided or not self.alert else _no_pose(len(tracks), "no_consensus")',
+        'return best if consistent or not self.alert else _no_pose(len(tracks), "no_consensus")',
         "return best",
     ),
     _rule(
@@ -89,8 +89,8 @@ RULES = (
     _rule(
         "prior of long-static points",
         SOLVER,
-        "self._optimise(tracks, expected, settled, expected)",
-        "self._optimise(tracks, expected, settled)",
+        "self._optimise(tracks, expected, surely_static, expected)",
+        "self._optimise(tracks, expected, surely_static)",
     ),
     _rule(
         "prior of near points",
@@ -104,7 +104,7 @@ RULES = (
     _rule(
         "noise of long-static points",
         SOLVER,
-        "if np.count_nonzero(settled) < 2 * self._config.min_features:",
+        "if np.count_nonzero(surely_static) < 2 * self._config.min_features:",
         "if True:",
     ),
     _rule("moving points are marked", TRACKER, "MAX_MISSES, self._solver.alert, static)", "MAX_MISSES, False, static)"),
@@ -153,7 +153,7 @@ RULES = (
         "self._recovery.motion.steady(image.stamp_ns) if bridge is None else None",
         "None",
     ),
-    _rule("other motions are tried", RECOVERY, "if self.free and expected.sigma_m > UNCERTAIN_M:", "if False:"),
+    _rule("other motions are tried", RECOVERY, "if self.unobstructed and expected.sigma_m > UNCERTAIN_M:", "if False:"),
     _rule(
         "velocity after recovery",
         TRACKER,
@@ -165,17 +165,17 @@ RULES = (
     _rule(
         "more of an occluded view",
         TRACKER,
-        "if not self._part.wanted(self._follower.held, image.stamp_ns):\n            return None",
+        "if not self._part.wanted(self._follower.reference, image.stamp_ns):\n            return None",
         "return None",
     ),
-    _rule("no new points from a part", TRACKER, "if self._recovery.free or not uncertain:", "if True:"),
+    _rule("no new points from a part", TRACKER, "if self._recovery.unobstructed or not uncertain:", "if True:"),
     _rule(
         "the better reference image",
         FOLLOWER,
-        "if self._held is None or self._in_view(image, later) >= self._in_view(self._held, later):",
+        "if self._reference is None or self._in_view(image, later) >= self._in_view(self._reference, later):",
         "if True:",
     ),
-    _rule("more reference points", TRACKER, "        self._hold_more()\n        bridge", "        bridge"),
+    _rule("more reference points", TRACKER, "        self._add_to_reference()\n        bridge", "        bridge"),
     _rule(
         "recall by distance from the prediction",
         RECOVERY,
@@ -198,8 +198,8 @@ RULES = (
     _rule(
         "share of an unobstructed view",
         RECOVERY,
-        "self.free = bool(np.minimum(self._occupied(corners), self._rows).sum() >= FREE_SHARE * self._cells)",
-        "self.free = True",
+        "self.unobstructed = bool(np.minimum(self._occupied(corners), self._rows).sum() >= OPEN_SHARE * self._cells)",
+        "self.unobstructed = True",
     ),
     _rule(
         "rows of an unobstructed view",
@@ -207,7 +207,7 @@ RULES = (
         "np.minimum(self._occupied(corners), self._rows).sum()",
         "self._occupied(corners).sum()",
     ),
-    _rule("occluded time counts a tenth", LOSS, "max(self._free_s, COVERED_SHARE * self._covered_s)", "self._free_s"),
+    _rule("occluded time counts a tenth", LOSS, "max(self._unobstructed_s, OCCLUDED_SHARE * self._occluded_s)", "self._unobstructed_s"),
     _rule(
         "recent places",
         RECOVERY,
@@ -222,7 +222,7 @@ RULES = (
     ),
     _rule("search in three rounds", TRACKER, "for reach, most in ROUNDS:", "for reach, most in ROUNDS[::2]:"),
     _rule("lost second image begins anew", LOSS, "second or max(", "max("),
-    _rule("blurred images", TRACKER, "return blurred if undivided else (tracks, solution)", "return tracks, solution"),
+    _rule("blurred images", TRACKER, "return blurred if consistent else (tracks, solution)", "return tracks, solution"),
     _rule("rotation of the whole image", TRACKER, "for anywhere in (False, True):", "for anywhere in ():"),
     _rule("rotation from anywhere", TRACKER, "for anywhere in (False, True):", "for anywhere in (False,):"),
     # Windows and stereo.
@@ -280,7 +280,7 @@ RULES = (
     _rule(
         "points go on after a correction",
         TRACKER,
-        "if not solution.reason and solution.undivided:\n            self._resumed",
+        "if not solution.reason and solution.consistent:\n            self._resumed",
         "if False:\n            self._resumed",
     ),
     _rule(

@@ -62,7 +62,7 @@ STEPS = ("step 0.1 x", "step 0.1 y", "step 0.2 z", "step 0.3 y", "step 0.5 y")
 
 REPLACED: dict[str, dict[str, Any]] = {
     "steps": {
-        f"{FLOW}.sudden_turn:SuddenTurns.wanted": staticmethod(_none),
+        f"{FLOW}.sudden_turn:SuddenTurns.from_config": staticmethod(_none),
     },
     "people": {
         f"{FLOW}.frame_pose:FramePoseSolver._contradicted": _none,

@@ -27,7 +27,7 @@ from benchmarks.attack import (
 )
 
 TURN_S = 60.0
-SETTLED_S = 5.0  # of each turn, and of each session, that do not count: processes start
+SURE_S = 5.0  # of each turn, and of each session, that do not count: processes start
 LATE_S = 0.1  # from image to pose: three images
 BUSY = 8
 REQUESTS = 200  # hostile ones before the next kind of attack
@@ -70,7 +70,7 @@ class Turns:
 
     def session(self) -> None:
         """A session begins."""
-        self._counts_from_s = max(self._counts_from_s, time.monotonic() + SETTLED_S)
+        self._counts_from_s = max(self._counts_from_s, time.monotonic() + SURE_S)
 
     def pose(self, captured_s: float) -> None:
         """A pose has arrived."""
@@ -85,7 +85,7 @@ class Turns:
             attacker = spawn.Process(target=attack, args=(self._target,), daemon=True) if attacked else None
             if attacker is not None:
                 attacker.start()
-            self._turn, self._counts_from_s = (busy, attacked), time.monotonic() + SETTLED_S
+            self._turn, self._counts_from_s = (busy, attacked), time.monotonic() + SURE_S
             over = self._over.wait(TURN_S)
             self._turn = None
             for process in (*loops, *([attacker] if attacker is not None else [])):

@@ -146,7 +146,7 @@ def _distances(rig: Rig, choice: Choice, effect: Consequences) -> Finding:
     """Effect of the significant terms on distances and on the trajectory's length if they are not corrected."""
     sigma = rig.left.fx * float(choice.sigma[1])
     text = f"disparity off by {effect.disparity_px:+.2f} +- {sigma:.2f} px"
-    if not choice.written.any():
+    if not choice.selected.any():
         return Finding("distances", 0, f"no significant error; disparity known to {sigma:.2f} px")
     level = max(level_of(effect.disparity_px, sigma, DISPARITY_PX), level_of(100 * effect.length, 0.0, LENGTH_PERCENT))
     return Finding("distances", level, f"{text}: {effect.text}", True, (effect.disparity_px,), (sigma,))

@@ -112,14 +112,14 @@ class Term:
     value: float
     sigma: float
     halves: tuple[float, ...]
-    written: bool
+    selected: bool
     why: str
 
     @property
     def line(self) -> str:
         """One readable line."""
         what = f"{self.value:+.3f} +- {self.sigma:.3f} {self.unit}"
-        return f"{self.name}: {'written' if self.written else 'unchanged'}, {what} ({self.why})"
+        return f"{self.name}: {'written' if self.selected else 'unchanged'}, {what} ({self.why})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class Choice:
     terms: tuple[Term, ...]
     value: F64  # (8,) zero where nothing is written
     sigma: F64  # (8,) standard deviations of all terms, written or not
-    written: Bool  # (8,)
+    selected: Bool  # (8,)
 
     def apply(self, rig: Rig) -> Rig:
         """The corrected rig; the same object when nothing is written."""

@@ -187,7 +187,9 @@ def as_text(report: CheckReport, name: str) -> str:
 
 def _written(report: CheckReport, path: Path) -> list[str]:
     """The content of the corrected rig, one line per parameter."""
-    lines = [f"{path}: {'corrected' if report.choice.written.any() else 'unchanged, the images support no correction'}"]
+    lines = [
+        f"{path}: {'corrected' if report.choice.selected.any() else 'unchanged, the images support no correction'}"
+    ]
     lines += [f"  {term.line}" for term in report.choice.terms]
     kept = "unchanged: they cannot be determined from images alone"
     return [*lines, f"  focal length of both cameras, length of the baseline: {kept}"]

@@ -10,11 +10,11 @@ class KeyframePoses:
 
     def __init__(self) -> None:
         self._poses: dict[int, F64] = {}  # of living keyframes: map_T_kf
-        self._carried: dict[int, tuple[int, F64]] = {}  # of culled ones: reference keyframe's id, its pose in it
+        self._moves_with: dict[int, tuple[int, F64]] = {}  # of culled ones: reference keyframe's id, its pose in it
         self._all: dict[int, F64] | None = None  # what `all` gave last, until something changes
 
     def __len__(self) -> int:
-        return len(self._poses) + len(self._carried)
+        return len(self._poses) + len(self._moves_with)
 
     def lives(self, kf_id: int) -> bool:
         """Whether the keyframe is known and not culled."""
@@ -29,10 +29,10 @@ class KeyframePoses:
         self._all = None
         for kf_id, map_T_kf in zip(update.kf_ids.tolist(), update.map_T_kf, strict=True):
             self._poses[kf_id] = map_T_kf.copy()
-        culled, carriers = update.culled_kf_ids.tolist(), update.carrier_kf_ids.tolist()
-        for kf_id, carrier, carrier_T_kf in zip(culled, carriers, update.carrier_T_kf, strict=True):
+        culled, references = update.culled_kf_ids.tolist(), update.carrier_kf_ids.tolist()
+        for kf_id, reference, reference_T_kf in zip(culled, references, update.carrier_T_kf, strict=True):
             self._poses.pop(kf_id, None)
-            self._carried[kf_id] = carrier, carrier_T_kf.copy()
+            self._moves_with[kf_id] = reference, reference_T_kf.copy()
 
     def all(self) -> dict[int, F64]:
         """map_T_kf (4, 4) by id, ascending, without keyframes whose reference keyframe is unknown."""
@@ -42,13 +42,13 @@ class KeyframePoses:
 
     def _put_together(self) -> dict[int, F64]:
         out = dict(self._poses)
-        for kf_id in self._carried:
+        for kf_id in self._moves_with:
             way, at = list[int](), kf_id
-            while at not in out and at in self._carried:
+            while at not in out and at in self._moves_with:
                 way.append(at)
-                at = self._carried[at][0]
+                at = self._moves_with[at][0]
             if at in out:
                 for k in reversed(way):
-                    carrier, carrier_T_kf = self._carried[k]
-                    out[k] = out[carrier] @ carrier_T_kf
+                    reference, reference_T_kf = self._moves_with[k]
+                    out[k] = out[reference] @ reference_T_kf
         return dict(sorted(out.items()))

@@ -31,7 +31,7 @@ class MapDelta:
     kf_rows: I64  # (K,) new or moved living keyframes, ascending
     map_T_kf: F64  # (K, 4, 4)
     culled_kf: I64  # (R, 2) rows: a culled keyframe, its reference keyframe
-    carrier_T_kf: F64  # (R, 4, 4) its pose relative to the reference keyframe
+    reference_T_kf: F64  # (R, 4, 4) its pose relative to the reference keyframe
     pt_rows: I64  # (P,) new or moved living points that have tracks, ascending
     xyz: F64  # (P, 3)
 
@@ -223,7 +223,7 @@ class Map:
         """(K, 4, 4) map_T_kf of every row; culled keyframes have moved with their reference keyframes."""
         poses = self.keyframes.map_T_kf.copy()
         gone = np.flatnonzero(~self.keyframes.alive)
-        poses[gone] = poses[self.keyframes.carrier[gone]] @ self.keyframes.carrier_T_kf[gone]
+        poses[gone] = poses[self.keyframes.reference[gone]] @ self.keyframes.reference_T_kf[gone]
         return poses
 
     def move_points(self, rows: I64, xyz: F64) -> None:
@@ -245,7 +245,7 @@ class Map:
     def _anchors(self, rows: I64) -> I64:
         """Living keyframes that carry points of these rows: what carries the anchor, where that was culled."""
         anchor = self.points.anchor[rows]
-        return np.where(self.keyframes.alive[anchor], anchor, self.keyframes.carrier[anchor])
+        return np.where(self.keyframes.alive[anchor], anchor, self.keyframes.reference[anchor])
 
     def remove_observations(self, rows: I64) -> None:
         """Remove observations; their points stay, even without any."""
@@ -296,13 +296,13 @@ class Map:
     def _carry(self, row: int) -> None:
         """Make another keyframe the reference of a keyframe, and of those whose reference it was."""
         others, _ = self.neighbours(row)
-        carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
+        reference = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
         table = self.keyframes
-        carrier_T_row = se3.inverse(table.map_T_kf[carrier]) @ table.map_T_kf[row]
-        carried = np.flatnonzero(table.carrier == row)
-        table.carrier_T_kf[carried] = carrier_T_row @ table.carrier_T_kf[carried]
-        table.carrier_T_kf[row] = carrier_T_row
-        table.carrier[carried], table.carrier[row] = carrier, carrier
+        reference_T_row = se3.inverse(table.map_T_kf[reference]) @ table.map_T_kf[row]
+        carried = np.flatnonzero(table.reference == row)
+        table.reference_T_kf[carried] = reference_T_row @ table.reference_T_kf[carried]
+        table.reference_T_kf[row] = reference_T_row
+        table.reference[carried], table.reference[row] = reference, reference
 
     def fuse(self, old: int, new: int, sigma: float = 1.0) -> None:
         """Fuse the points of two rows: `new` takes over the observations and ids of `old`.
@@ -357,7 +357,7 @@ class Map:
         points.anchor[:] = now[self._anchors(np.arange(len(points)))]
         points.last_seen[:] = np.where(points.last_seen >= 0, before[points.last_seen], -1)
         self.observations.kf[:] = now[self.observations.kf]
-        for column in (table.previous, table.carrier):
+        for column in (table.previous, table.reference):
             column[:] = np.where(column >= 0, now[column], -1)
         table.keep(np.flatnonzero(stay))
         self._kf_rows = {kf_id: row for row, kf_id in enumerate(table.kf_id.tolist())}
@@ -420,7 +420,7 @@ class Map:
         kf = np.array(sorted(self._changed_kf), np.int64)
         kf = kf[self.keyframes.alive[kf]]
         gone = np.array(self._culled_kf, np.int64)
-        culled = np.stack([gone, self.keyframes.carrier[gone]], 1), self.keyframes.carrier_T_kf[gone]
+        culled = np.stack([gone, self.keyframes.reference[gone]], 1), self.keyframes.reference_T_kf[gone]
         pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
         pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0]) & (self.points.pt_id[pt] >= 0)]
         self._changed_kf.clear()

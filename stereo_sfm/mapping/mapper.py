@@ -224,7 +224,7 @@ class Mapper(AnyMapper):
             map_T_odom=self._map_T_odom.copy(),
             culled_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 0]],
             carrier_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 1]],
-            carrier_T_kf=delta.carrier_T_kf,
+            carrier_T_kf=delta.reference_T_kf,
             refused_kf_ids=refused,
             calibration=revised,
             row_errors=row_errors,
@@ -319,10 +319,10 @@ class Mapper(AnyMapper):
         """The loop between the living keyframes that carry its two ends, if one of them was culled."""
         keyframes = self.map.keyframes
         rows = [self.map.kf_row(loop.candidate_kf_id), self.map.kf_row(loop.kf_id)]
-        ends = [row if keyframes.alive[row] else int(keyframes.carrier[row]) for row in rows]
+        ends = [row if keyframes.alive[row] else int(keyframes.reference[row]) for row in rows]
         if ends == rows:
             return loop
-        offset = [np.eye(4) if e == r else keyframes.carrier_T_kf[r] for e, r in zip(ends, rows, strict=True)]
+        offset = [np.eye(4) if e == r else keyframes.reference_T_kf[r] for e, r in zip(ends, rows, strict=True)]
         ids, candidate_T_kf = keyframes.kf_id[ends].tolist(), offset[0] @ loop.candidate_T_kf @ se3.inverse(offset[1])
         matches = loop.matches
         if ids[0] > ids[1]:  # the candidate's reference is newer: swap, the candidate is the older keyframe

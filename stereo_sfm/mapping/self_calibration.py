@@ -116,7 +116,7 @@ class SelfCalibration:
         return self._revise()
 
     @staticmethod
-    def wanted(config: Config, rig: Rig) -> SelfCalibration | None:
+    def from_config(config: Config, rig: Rig) -> SelfCalibration | None:
         """The self-calibration of a run, None if it is off or the rig has one camera."""
         mode, flow = config.self_calibration.mode, config.odometry.method == "flow"
         if mode == "off" or not flow or rig.second_camera is None:
@@ -173,7 +173,7 @@ class SelfCalibration:
             return None
         if drift is not None:
             return self._revision(found, "drift", windows[-1].first_kf_id, self._on_the_way(found.value))
-        why = "refined" if self._corrected[found.written].all() else "significant"
+        why = "refined" if self._corrected[found.selected].all() else "significant"
         if (MISLED_SHARE * np.abs(found.value) > found.sigma).any():
             self._misled_kf_id = windows[-1].last_kf_id
         return self._revision(found, why, self._since)
@@ -218,7 +218,7 @@ class SelfCalibration:
         new = np.where(ignored, np.inf, np.where(wrong, FURTHER_SIGMAS, SIGMAS))
         sigmas, back = np.where(self._corrected, refined_sigmas, new), kept - self.terms
         choice = self._choose(whole, parts, sigmas)
-        if not (drift or self._helps(halves, [p.without(choice.written).value for p in parts], basis, back)):
+        if not (drift or self._helps(halves, [p.without(choice.selected).value for p in parts], basis, back)):
             choice = self._choose(whole, parts, np.where(self._corrected, refined_sigmas, np.inf))
         hunting = self._corrected & (np.abs(choice.value) > HUNTING_SIGMAS * self._sigma)
         hunting &= np.abs(choice.value + basis @ kept) < SIGMAS * choice.sigma
@@ -227,7 +227,7 @@ class SelfCalibration:
             return self._change(windows, drift, refined_sigmas, halves)
         value = np.asarray(np.linalg.solve(basis, choice.value), float) + back
         covariance = whole.by(np.asarray(np.linalg.inv(basis), float)).covariance
-        return _Change(value, choice.sigma, covariance, choice.written) if value.any() else None
+        return _Change(value, choice.sigma, covariance, choice.selected) if value.any() else None
 
     def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
         return choose(whole, parts, self._rig.readout_s > 0, sigmas, self._corrected)
@@ -270,7 +270,7 @@ class SelfCalibration:
         self, change: _Change, why: str, since_kf_id: int, on_the_way: tuple[tuple[int, F64], ...] = ()
     ) -> Revision:
         self.terms = self.terms + change.value
-        self._corrected |= change.written
+        self._corrected |= change.selected
         self._sigma = change.sigma
         self._revised_ns = self._stamp_ns
         text = _text(change.value, change.sigma)
@@ -315,7 +315,7 @@ class _Change:
     value: F64  # (8,)
     sigma: F64  # (8,) of those of the basis
     covariance: F64  # (8, 8)
-    written: Bool  # (8,)
+    selected: Bool  # (8,)
 
 
 def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:

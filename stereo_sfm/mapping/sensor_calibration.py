@@ -75,7 +75,7 @@ class SensorCalibration:
         self._due_ns = 0
 
     @staticmethod
-    def wanted(config: Config, rig: Rig) -> SensorCalibration | None:
+    def from_config(config: Config, rig: Rig) -> SensorCalibration | None:
         """That of a run; None if it is not asked for, or the rig has no sensors."""
         sensors = (rig.imu is not None and config.tracker.inertial) or (rig.wheel is not None and config.tracker.wheels)
         return SensorCalibration(rig) if config.tracker.calibrate_sensors and sensors else None

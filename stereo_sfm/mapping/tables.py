@@ -19,8 +19,8 @@ class KeyframeTable(Columns):
     previous: I64 = column(np.int64, -1)  # row of the keyframe before it in the same submap, -1: none
     obs_first: I64 = column(np.int64, 0)  # first row of its observations, which follow each other
     obs_count: I64 = column(np.int64, 0)  # observations made, of which some may have been removed since
-    carrier: I64 = column(np.int64, -1)  # of a culled keyframe: the row of the one it moves with, -1 if alive
-    carrier_T_kf: F64 = column(np.float64, np.eye(4), (4, 4))  # (K, 4, 4)
+    reference: I64 = column(np.int64, -1)  # of a culled keyframe: the row of the one it moves with, -1 if alive
+    reference_T_kf: F64 = column(np.float64, np.eye(4), (4, 4))  # (K, 4, 4)
     down: F64 = column(np.float64, 0.0, (3,))  # (K, 3) gravity's direction in the camera, zero: unknown
     down_sigma: F64 = column(np.float64, 0.0)  # radians, 0: unknown
     velocity: F64 = column(np.float64, 0.0, (3,))  # (K, 3) m/s in the IMU's axes

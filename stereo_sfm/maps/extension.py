@@ -98,7 +98,7 @@ class Extension(Mapper):
         if kf_id < 0 or self.map.keyframes.alive[row := self.map.kf_row(kf_id)]:
             return
         table = self.map.keyframes
-        self._found_kf = int(table.kf_id[table.carrier[row]]), table.carrier_T_kf[row] @ living_T_kf
+        self._found_kf = int(table.kf_id[table.reference[row]]), table.reference_T_kf[row] @ living_T_kf
 
     def _with_everything(self, update: MapUpdate) -> MapUpdate:
         keyframes, points = self.map.living_keyframes(), self.map.living_points()

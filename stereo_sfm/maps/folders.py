@@ -79,8 +79,8 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     from stereo_sfm.mapping.self_calibration import SelfCalibration
     from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 
-    wanted = SelfCalibration.wanted(config, rig) if config.mapper.enabled else None
-    sensors = SensorCalibration.wanted(config, rig)
+    wanted = SelfCalibration.from_config(config, rig) if config.mapper.enabled else None
+    sensors = SensorCalibration.from_config(config, rig)
     if folders.map_in is None:
         return Mapper(config.mapper, rig, spans, config.loop, wanted, sensors)
     from stereo_sfm.maps.extension import Extension

@@ -36,7 +36,7 @@ class FeatureTracker(DescriptorTracker):
         self, config: Config, rig: Rig, spans: NoSpans | None = None, ground_truth: Trajectory | None = None
     ) -> None:
         super().__init__(config, rig, spans)
-        self._place_corners = PlaceCorners.wanted(config, rig)
+        self._place_corners = PlaceCorners.from_config(config, rig)
         self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
         self._pairing = Pairing(config.features, self._pixel)

@@ -116,7 +116,7 @@ def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
     find_deformed(pyramid[1], uv, warps, np.zeros(1, np.int64), patches, 1, 1, uv.copy(), warps[0].copy())
     solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), RollingShutter(rig))
     solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), config.tracker.sigma_px, 1.0)
-    solver.pull(Tracks(), solution)
+    solver.shift_chi2(Tracks(), solution)
     solver.influence(Tracks(), solution)
     if rig.imu is not None and config.tracker.inertial:
         _warm_up_inertial(rig.imu)
@@ -167,7 +167,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
         for keyframe in keyframes(rig):
             mapper.step(keyframe)
         mapper.finish([])
-        if SelfCalibration.wanted(config, rig) is not None:
+        if SelfCalibration.from_config(config, rig) is not None:
             solve_window(rig, [SeenPoints.of(k) for k in keyframes(rig)[:: FRAMES // 4]], np.zeros(RIG_TERMS))
     elif stage == "loop":
         eager = dataclasses.replace(config.loop, min_gap=1, min_score=0.0, pause=0)

@@ -39,8 +39,8 @@ def make_tracker(
         from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
         from stereo_sfm.tracking.flow.tracker import Tracker
 
-        corners, sides = PlaceCorners.wanted(config, rig), SideViews.wanted(config, rig)
-        tracker = Tracker(config.tracker, rig, spans, corners, places, sides, SuddenTurns.wanted(config, rig))
+        corners, sides = PlaceCorners.from_config(config, rig), SideViews.from_config(config, rig)
+        tracker = Tracker(config.tracker, rig, spans, corners, places, sides, SuddenTurns.from_config(config, rig))
     return _papers().around(tracker, config, rig) if config.manhattan.enabled else tracker
 
 

@@ -25,7 +25,7 @@ def estimated(*values: float) -> Estimate:
 def test_a_term_needs_several_sigmas_and_both_halves() -> None:
     halves = estimated(8, 3, 8, 0, 0, -9), estimated(12, 3, -1, 0, 0, -6)
     choice = choose(estimated(10, 3, 9, 0, 0, -7), halves)
-    assert choice.written.tolist() == [True, False, False, False, False, True, False, False]
+    assert choice.selected.tolist() == [True, False, False, False, False, True, False, False]
     assert "10 sigmas" in choice.terms[0].why and "at least 4 required" in choice.terms[1].why
     assert "but the halves" in choice.terms[2].why
     assert choice.value[1] == choice.value[2] == 0.0
@@ -35,13 +35,13 @@ def test_a_term_confirmed_before_needs_no_halves() -> None:
     halves = estimated(-1, 5), estimated(9, 5)
     confirmed = np.arange(RIG_TERMS) == 0
     choice = choose(estimated(4, 5), halves, sigmas=np.where(confirmed, 1.0, 5.0), confirmed=confirmed)
-    assert choice.written[:2].tolist() == [True, True]
-    assert not choose(estimated(4, 5), halves, sigmas=np.where(confirmed, 1.0, 5.0)).written[0]
+    assert choice.selected[:2].tolist() == [True, True]
+    assert not choose(estimated(4, 5), halves, sigmas=np.where(confirmed, 1.0, 5.0)).selected[0]
 
 
 def test_without_a_second_half_nothing_is_written_and_the_rig_is_the_same() -> None:
     choice = choose(estimated(10, 10, 10, 10, 10, 10), ())
-    assert not choice.written.any()
+    assert not choice.selected.any()
     assert choice.apply(RIGS["pinhole"]) is RIGS["pinhole"]
 
 
@@ -65,7 +65,7 @@ def test_terms_that_trade_with_one_that_stays_take_its_part() -> None:
     value[a], value[b] = 12 * SIGMA[a], 3 * SIGMA[b]
     both = Estimate(value, covariance)
     choice = choose(both, (both, both))
-    assert choice.written[a] and not choice.written[b]
+    assert choice.selected[a] and not choice.selected[b]
     assert choice.value[a] == pytest.approx(value[a] - 24.5 / 25 * 3 * SIGMA[a])
 
 
@@ -79,14 +79,14 @@ def test_only_the_faulty_term_is_written_and_the_common_focal_length_never() -> 
     wrong = turned(magnified(RIGS["pinhole"], 0.98, 0.98), (0.0, 0.2, 0.0))
     correction = estimate(wrong, SEEN["pinhole"])
     choice = choose(correction.whole, correction.halves)
-    assert choice.written[1] and not choice.written[0] and not choice.written[2]
+    assert choice.selected[1] and not choice.selected[0] and not choice.selected[2]
     mended = choice.apply(wrong)
     assert mended.left.fx == wrong.left.fx and mended.baseline == pytest.approx(wrong.baseline, rel=1e-12)
 
 
 def test_a_rolling_shutter_may_pretend_what_motion_shows() -> None:
     choice = choose(estimated(10, 10, 10, 10, 10, 10), (estimated(10, 10, 10, 10, 10, 10),) * 2, rolling=True)
-    assert choice.written.tolist() == [True, False, True, False, False, True, False, False]
+    assert choice.selected.tolist() == [True, False, True, False, False, True, False, False]
 
 
 def test_consequences_of_a_disparity_error() -> None:

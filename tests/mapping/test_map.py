@@ -260,7 +260,7 @@ def test_culled_keyframe_leaves_the_chain_and_its_points_find_another_anchor() -
     snap = m.snapshot()
     assert snap.kf_ids.tolist() == [1, 2]
     assert (snap.obs_kf < 2).all()
-    assert (snap.anchors >= 0).all()  # point 10, which nobody sees now, goes with the carrier
+    assert (snap.anchors >= 0).all()  # point 10, which nobody sees now, goes with the reference
 
 
 def test_culled_keyframes_move_with_their_carriers_and_are_reported_once() -> None:
@@ -272,14 +272,14 @@ def test_culled_keyframes_move_with_their_carriers_and_are_reported_once() -> No
     m.cull_keyframe(0)
     delta = m.take_delta()
     assert delta.culled_kf[:, 0].tolist() == [1, 0] and delta.kf_rows.tolist() == [2, 3]
-    carrier = int(m.keyframes.carrier[0])
-    assert m.keyframes.carrier[1] == carrier and m.keyframes.alive[carrier]
+    reference = int(m.keyframes.reference[0])
+    assert m.keyframes.reference[1] == reference and m.keyframes.alive[reference]
     np.testing.assert_allclose(m.keyframe_poses(), poses, atol=1e-12)
     move = se3.exp(np.array([1.0, -2, 0.5, 0.3, 0.2, -0.1]))
-    m.move_keyframes(np.array([carrier]), (move @ poses[carrier])[None])
+    m.move_keyframes(np.array([reference]), (move @ poses[reference])[None])
     np.testing.assert_allclose(m.keyframe_poses()[:2], move @ poses[:2], atol=1e-12)
     delta = m.take_delta()
-    assert delta.kf_rows.tolist() == [carrier] and len(delta.culled_kf) == 0  # what is carried costs nothing
+    assert delta.kf_rows.tolist() == [reference] and len(delta.culled_kf) == 0  # what is carried costs nothing
 
 
 def test_neighbours_come_in_order() -> None:

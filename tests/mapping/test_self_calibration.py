@@ -256,9 +256,9 @@ def test_the_same_keyframes_give_the_same_bits() -> None:
 def test_which_runs_are_corrected(mode: str) -> None:
     config = replace(Config(), self_calibration=SelfCalibrationConfig(mode))
     stereo, mono = RIGS["pinhole"], Rig(RIGS["pinhole"].left)
-    assert (SelfCalibration.wanted(config, stereo) is None) == (mode == "off")
-    assert SelfCalibration.wanted(config, mono) is None
-    assert SelfCalibration.wanted(config, replace(stereo, depth=True)) is None
+    assert (SelfCalibration.from_config(config, stereo) is None) == (mode == "off")
+    assert SelfCalibration.from_config(config, mono) is None
+    assert SelfCalibration.from_config(config, replace(stereo, depth=True)) is None
 
 
 @pytest.mark.parametrize("degrees", [(0.2, 0.0, 0.0), (0.0, 0.0, 0.2)])

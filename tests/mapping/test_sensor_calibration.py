@@ -105,9 +105,9 @@ def test_poses_of_two_submaps_are_not_compared() -> None:
 def test_wanted_only_when_asked_for() -> None:
     rig = drive(0).source.rig
     asked = load(None, ["tracker.calibrate_sensors=true"])
-    assert SensorCalibration.wanted(Config(), rig) is None
-    assert SensorCalibration.wanted(asked, rig) is not None
-    assert SensorCalibration.wanted(asked, replace(rig, imu=None, wheel=None)) is None
+    assert SensorCalibration.from_config(Config(), rig) is None
+    assert SensorCalibration.from_config(asked, rig) is not None
+    assert SensorCalibration.from_config(asked, replace(rig, imu=None, wheel=None)) is None
 
 
 def test_the_mapper_brings_it_without_a_map_too() -> None:

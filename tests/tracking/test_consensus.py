@@ -1,4 +1,4 @@
-"""Moving objects: settled points determine the pose, moving points are marked."""
+"""Moving objects: static points determine the pose, moving points are marked."""
 
 from __future__ import annotations
 
@@ -245,9 +245,9 @@ def test_the_degrees_of_freedom_of_a_pose_are_shared_by_its_points() -> None:
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     tracks = scene(np.random.default_rng(0))[0].keep(np.arange(STILL + MOVING) < STILL)
     solution = solver.solve(tracks, ExpectedMotion(MOVED, se3.log(MOVED), SECONDS), np.eye(4))
-    freedoms = solver.influence(tracks, solution)[0]
-    assert freedoms.sum() == pytest.approx(6.0, rel=0.1) and freedoms.max() < 0.5
-    assert freedoms.argmax() in np.argsort(tracks.rho)[-10:]
+    leverages = solver.influence(tracks, solution)[0]
+    assert leverages.sum() == pytest.approx(6.0, rel=0.1) and leverages.max() < 0.5
+    assert leverages.argmax() in np.argsort(tracks.rho)[-10:]
 
 
 def test_errors_at_a_pose_by_others_are_as_large_as_expected() -> None:
@@ -270,7 +270,7 @@ def test_a_smaller_group_that_moves_is_marked_at_once() -> None:
     tracks, on_person = scene(np.random.default_rng(1))
     fewer = np.arange(len(tracks)) < STILL + 50
     tracks, on_person = tracks.keep(fewer), on_person[fewer]
-    tracks.age[:] = 0  # nothing has settled: most decide
+    tracks.age[:] = 0  # no point is known for long: most decide
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.002)), np.zeros(6), SECONDS)
     solution = solver.solve(tracks, expected, np.eye(4), before=len(tracks))
@@ -451,8 +451,8 @@ def test_an_alert_lasts_while_a_group_disagrees() -> None:
     assert not solver.alert
 
 
-@pytest.mark.parametrize("settled", [True, False])
-def test_little_of_an_open_view_is_enough_while_what_was_known_before_agrees(settled: bool) -> None:
+@pytest.mark.parametrize("surely_static", [True, False])
+def test_little_of_an_open_view_is_enough_while_what_was_known_before_agrees(surely_static: bool) -> None:
     tracks, on_person = scene(np.random.default_rng(2))
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     expected = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
@@ -460,8 +460,8 @@ def test_little_of_an_open_view_is_enough_while_what_was_known_before_agrees(set
     assert solver.alert
     solver.open_view = 200.0
     left = tracks.keep(~on_person & (np.arange(len(tracks)) < 25))
-    left.age[:] = 20 if settled else 1
-    assert (not solver.solve(left, expected, np.eye(4), before=len(left)).reason) == settled
+    left.age[:] = 20 if surely_static else 1
+    assert (not solver.solve(left, expected, np.eye(4), before=len(left)).reason) == surely_static
 
 
 def test_of_two_results_for_an_image_the_expected_one_is_taken_while_objects_move() -> None:

@@ -24,7 +24,7 @@ DISTANCE = 3.0
 
 
 def view() -> tuple[Follower, F64, Bool]:
-    """The held points, (N, 2) px: 600 on the ceiling, in the upper half of the image, and 100 on shelves below."""
+    """The reference points, (N, 2) px: 600 on the ceiling, in the upper half of the image, and 100 on shelves below."""
     rng = np.random.default_rng(0)
     low, high = np.array([40.0, 40.0]), np.array([WIDTH - 40.0, HEIGHT - 40.0])
     middle = 0.5 * HEIGHT
@@ -51,7 +51,7 @@ def view() -> tuple[Follower, F64, Bool]:
     )
     config, shutter = TrackerConfig(), RollingShutter(RIG)
     follower = Follower(config, RIG, VisibleArea(RIG.left, config.max_angle_deg, None), shutter)
-    follower.hold(StereoPyramids((), ()), tracks, np.ones(n, bool), np.eye(4), np.eye(4))
+    follower.refer_to(StereoPyramids((), ()), tracks, np.ones(n, bool), np.eye(4), np.eye(4))
     return follower, uv, uv[:, 1] <= middle
 
 

@@ -18,14 +18,14 @@ from stereo_sfm.drivers.sim.world import Layout
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.recent_places import RecentPlaces
 from stereo_sfm.pipeline.stages import make_tracker_with_places
-from stereo_sfm.tracking.flow.follower import Follower, Held
+from stereo_sfm.tracking.flow.follower import Follower, ReferenceImage
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.motion_prior import MotionPrior
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import REACH, Recovery
 from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.tracking.flow.tracks import Tracks
-from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
 from stereo_sfm.types import F64, Corners, Frame, Keyframe, StereoImage, TrackState
 from tests.synthetic import pinhole_rig
 
@@ -150,8 +150,8 @@ def moving(seconds: F64) -> list[F64]:
     return [se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.2, 0.0]) * t) for t in seconds]
 
 
-def test_trusted_motion_is_the_mean_of_the_last_second_with_growing_covariance() -> None:
-    motion = TrustedMotion()
+def test_motion_prior_is_the_mean_of_the_last_second_with_growing_covariance() -> None:
+    motion = MotionPrior()
     times = np.arange(0, 3, 0.1)
     for t, pose in zip(times, moving(times), strict=True):
         motion.add(round(t * 1e9), pose)
@@ -164,7 +164,7 @@ def test_trusted_motion_is_the_mean_of_the_last_second_with_growing_covariance()
 
 
 def test_a_turn_is_not_predicted_to_go_on_for_long() -> None:
-    motion = TrustedMotion()
+    motion = MotionPrior()
     for t, pose in zip(np.arange(0, 3, 0.1), moving(np.arange(0, 3, 0.1)), strict=True):
         motion.add(round(t * 1e9), pose)
     last = moving(np.array([2.9]))[0]
@@ -255,7 +255,7 @@ def test_a_rim_beside_a_cover_is_not_a_free_view() -> None:
         recovery.motion.add(0, np.eye(4))
         pyramids = StereoPyramids([], np.zeros((1, 1), np.float32))
         list(recovery.search(covered(0), pyramids, recovery.motion.expect(10**8)))
-        assert recovery.free == free
+        assert recovery.unobstructed == free
 
 
 def wall(uv: F64, at: float = 0.0) -> Tracks:
@@ -284,52 +284,52 @@ MIDDLE = (np.abs(EVERYWHERE / [WIDTH, HEIGHT] - 0.5) < 0.25).all(1)
 PYRAMIDS = StereoPyramids((), ())
 
 
-@pytest.mark.parametrize(("metres", "held_anew"), [(0.0, False), (0.5, False), (2.5, True)])
-def test_half_the_view_is_held_once_little_of_a_whole_one_is_left(metres: float, held_anew: bool) -> None:
+@pytest.mark.parametrize(("metres", "renewed"), [(0.0, False), (0.5, False), (2.5, True)])
+def test_half_the_view_becomes_the_reference_once_little_of_a_whole_one_is_left(metres: float, renewed: bool) -> None:
     """A robot that stands keeps the image of the whole view; points added to it after a loss change nothing."""
     kept, tracks = follower(), wall(EVERYWHERE)
-    kept.hold(PYRAMIDS, tracks, np.ones(len(tracks), bool), np.eye(4), np.eye(4))
-    first = kept.held
+    kept.refer_to(PYRAMIDS, tracks, np.ones(len(tracks), bool), np.eye(4), np.eye(4))
+    first = kept.reference
     first.add(tracks.append(tracks).append(tracks))
-    kept.hold(PYRAMIDS, wall(EVERYWHERE, metres), EVERYWHERE[:, 0] < WIDTH / 2, along(metres), along(metres))
-    assert (kept.held is not first) == held_anew
+    kept.refer_to(PYRAMIDS, wall(EVERYWHERE, metres), EVERYWHERE[:, 0] < WIDTH / 2, along(metres), along(metres))
+    assert (kept.reference is not first) == renewed
 
 
 @pytest.mark.parametrize(("metres", "middle_is_better"), [(0.0, False), (2.0, True)])
 def test_what_will_be_in_view_is_held(metres: float, middle_is_better: bool) -> None:
     """What a robot drives towards is still in view after it went on unseen, what is beside that is not."""
     kept, tracks = follower(), wall(EVERYWHERE)
-    kept.hold(PYRAMIDS, tracks, MIDDLE, np.eye(4), along(metres))
-    first = kept.held
-    kept.hold(PYRAMIDS, tracks, ~MIDDLE, np.eye(4), along(metres))
-    assert (kept.held is first) == middle_is_better
+    kept.refer_to(PYRAMIDS, tracks, MIDDLE, np.eye(4), along(metres))
+    first = kept.reference
+    kept.refer_to(PYRAMIDS, tracks, ~MIDDLE, np.eye(4), along(metres))
+    assert (kept.reference is first) == middle_is_better
 
 
 def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> None:
-    held, other = (Held(StereoPyramids((), ()), Tracks(), np.eye(4)) for _ in range(2))
+    reference, other = (ReferenceImage(StereoPyramids((), ()), Tracks(), np.eye(4)) for _ in range(2))
     part = PartialView()
-    assert not part.wanted(held, 0)
+    assert not part.wanted(reference, 0)
     few, more = 2e-4 * np.eye(6), 1e-4 * np.eye(6)
-    part.begin(held, 0.4, few, 0)
-    assert part.wanted(held, 10**9)
-    assert not part.wanted(held, 10**9 + 1)
-    assert not part.wanted(other, 0)  # which was held since, and has the error
+    part.begin(reference, 0.4, few, 0)
+    assert part.wanted(reference, 10**9)
+    assert not part.wanted(reference, 10**9 + 1)
+    assert not part.wanted(other, 0)  # which became the reference since, and has the error
     near, far = (se3.exp(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0])) for metres in (0.05, 0.5))
     assert part.improved(np.eye(4), near, 0.6, more)
     assert not part.improved(np.eye(4), near, 0.6, few)
     assert not part.improved(np.eye(4), near, 0.5, more)
     assert part.improved(np.eye(4), far, 0.6, few)  # one of the two is wrong: the one by less of the view
     assert not part.improved(np.eye(4), far, 0.5, more)
-    assert not part.uncertain(held, more, 0)  # 17 mm
-    assert part.uncertain(held, 4 * more, 0)
+    assert not part.uncertain(reference, more, 0)  # 17 mm
+    assert part.uncertain(reference, 4 * more, 0)
     assert not part.uncertain(other, 4 * more, 0)
     part.end(0.6)
-    assert part.wanted(held, 0)
+    assert part.wanted(reference, 0)
     part.end(0.7)
-    assert not part.wanted(held, 0)
-    part.begin(held, 0.7, more, 0)
-    assert not part.wanted(held, 0)
-    assert not part.uncertain(held, 4 * more, 0)
+    assert not part.wanted(reference, 0)
+    part.begin(reference, 0.7, more, 0)
+    assert not part.wanted(reference, 0)
+    assert not part.uncertain(reference, 4 * more, 0)
 
 
 def test_a_new_submap_is_tracked_on_although_people_moved_before_it() -> None:
@@ -355,7 +355,7 @@ def test_a_new_submap_is_tracked_on_although_people_moved_before_it() -> None:
 
 
 def test_a_robot_of_unknown_speed_may_be_anywhere_near() -> None:
-    motion = TrustedMotion()
+    motion = MotionPrior()
     motion.add(0, np.eye(4))
     there = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.05, 0.0]))
     assert motion.expect(100_000_000).sigmas_off(there) < REACH

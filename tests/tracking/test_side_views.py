@@ -49,7 +49,7 @@ def look(rig: Rig, world_T_cam: F64, seed: int = 0) -> Corners:
     left = build_pyramid(picture(rig.left, world_T_cam, fronts), 4)
     right = build_pyramid(picture(rig.right, world_T_cam @ rig.left_T_right, fronts), 2)
     config = Config()
-    corners, views = PlaceCorners.wanted(config, rig), SideViews.wanted(config, rig)
+    corners, views = PlaceCorners.from_config(config, rig), SideViews.from_config(config, rig)
     assert corners is not None and views is not None
     return views.find(left, right, corners.find_in(left, right), np.eye(4), 0)
 
@@ -91,7 +91,7 @@ def test_views_near_the_last_ones_say_nothing_new() -> None:
     rig, config = make_rig("fisheye", (424, 400)), Config()
     image = picture(rig.left, pose(0, 0, 0), (texture(0), texture(1)))
     left, right = build_pyramid(image, 4), build_pyramid(image, 2)
-    views = SideViews.wanted(config, rig)
+    views = SideViews.from_config(config, rig)
     assert views is not None
     views.find(left, right, Corners.none(), np.eye(4), 0)
     assert not views._due(pose(0, 0.1, 3.0), 0)

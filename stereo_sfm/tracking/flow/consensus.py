@@ -21,7 +21,7 @@ from stereo_sfm.types import F64, I32, I64, Bool, Corners
 
 MIN_GROUP = 8  # points of a group; fewer do not define a motion
 AGREEING_SHARE = 0.65  # of the points that were tracked; if fewer agree, another motion is searched for
-SETTLED_S = 0.3  # a point that was tracked for so long has its full weight ...
+SURE_S = 0.3  # a point that was tracked for so long has its full weight ...
 MIN_WEIGHT = 0.1  # ... and a new one this
 MIN_OPEN_SHARE = 0.2  # of the inliers in an unobstructed view; with fewer the camera counts as covered
 WEIGHT_RATIO = 1.05  # by which another motion must outweigh the one that all points give

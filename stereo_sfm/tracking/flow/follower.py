@@ -25,7 +25,7 @@ from stereo_sfm.types import F64, I64, Bool
 
 WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the search starts in the half image
 ALIGNED_PX = 1.5  # the same, below which first appearances are aligned from the predictions
-STORED = 4  # times max_features: points of the last image and of the held one, and new ones of the held one
+STORED = 4  # times max_features: points of the last image and of the reference image, and new ones of it
 MIN_COARSE_NCC = 0.65  # of a window found again in the half image
 GRID = 8, 6  # columns and rows of the image
 CELL_POINTS = 4.0  # with which a cell counts fully
@@ -34,7 +34,7 @@ SEARCH_STEPS = 14  # offsets of a search on either side
 
 
 @dataclass
-class Held:
+class ReferenceImage:
     """The trusted image from which tracking is recovered."""
 
     images: StereoPyramids
@@ -66,7 +66,7 @@ class Follower:
         self._config, self._area, self._shutter, self._camera = config, area, shutter, rig.left
         self._patches = Patches(STORED * config.max_features)
         self._last: klt.Pyramid | None = None
-        self._held: Held | None = None
+        self._reference: ReferenceImage | None = None
         self._view: tuple[Tracks, F64, F64, F64] | None = None  # the last result of `_seen_from`: points, pose, result
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._coarsest_level = config.pyramid_levels - 1
@@ -85,23 +85,23 @@ class Follower:
         return self._find(tracks, last_pose, pyramid, expected.pose, guess, blurred)
 
     @property
-    def held(self) -> Held:
+    def reference(self) -> ReferenceImage:
         """The image from which tracking is recovered; there is one after the first trusted image."""
-        assert self._held is not None
-        return self._held
+        assert self._reference is not None
+        return self._reference
 
-    def hold(self, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64, later: F64) -> None:
+    def refer_to(self, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64, later: F64) -> None:
         """Keep an image with a trusted pose (4, 4) and its trusted points (N,) for recovery, if it is the better one.
 
         Whatever is about to cover the camera already hides a part of the last images. The better image is the one that
         shows more of what would be in view from the pose `later` (4, 4), if the robot went on unseen. Time does not
         count: who comes towards the robot hides the middle of the view for seconds.
         """
-        image = Held(images, tracks.keep(trusted), pose)
-        if self._held is None or self._in_view(image, later) >= self._in_view(self._held, later):
-            self._held = image
+        image = ReferenceImage(images, tracks.keep(trusted), pose)
+        if self._reference is None or self._in_view(image, later) >= self._in_view(self._reference, later):
+            self._reference = image
 
-    def _in_view(self, image: Held, pose: F64) -> float:
+    def _in_view(self, image: ReferenceImage, pose: F64) -> float:
         """How many points tracked in an image would be in view from a pose (4, 4), in no part more than make it count.
 
         They count by how similar they look: by the ratio of their distances and the cosine between their directions.
@@ -116,23 +116,23 @@ class Follower:
 
     def forget(self) -> None:
         """Give up the reference image: a new odometry begins."""
-        self._held = None
+        self._reference = None
 
-    def renewed(self, held: Held) -> Tracks:
+    def renewed(self, reference: ReferenceImage) -> Tracks:
         """The points of the reference image, with their appearance in it instead of their first one."""
-        rows, slots = self.begin(held.images.left, held.tracks.uv, held.pose)
-        tracks = held.tracks.keep(_mask(rows, len(held.tracks)))
+        rows, slots = self.begin(reference.images.left, reference.tracks.uv, reference.pose)
+        tracks = reference.tracks.keep(_mask(rows, len(reference.tracks)))
         tracks.slot, tracks.warp = slots, np.tile(np.eye(2), (len(rows), 1, 1))
         return tracks
 
     def find_again(self, pyramid: klt.Pyramid, pose: F64, reach: float, most: int) -> Tracks:
-        """The held points that are found from another, possibly distant pose (4, 4).
+        """The reference image's points that are found from another, possibly distant pose (4, 4).
 
         Args:
             reach: of the search around the predicted pixels, as a share of the image's width.
             most: of the points that are looked for, evenly chosen.
         """
-        tracks = self.held.tracks
+        tracks = self.reference.tracks
         guess, warps = self._seen_from(pose)
         rows = np.flatnonzero(self._visible(guess, warps))
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
@@ -144,11 +144,11 @@ class Follower:
             pyramid[1], guess[rows], warps @ tracks.warp, tracks.slot, self._patches.patch, radius, step, uv, warp
         )
         self.search_widely()
-        curvature = self._curvatures(tracks, self.held.pose, pose)
+        curvature = self._curvatures(tracks, self.reference.pose, pose)
         return self._kept(tracks, *self._align(pyramid, uv, warp, curvature, tracks.slot, ncc > MIN_COARSE_NCC))
 
     def recall(self, found: F64, pose: F64, seen: F64 | None = None, cells_needed: float = 1.0) -> float:
-        """The share of the view from a pose (4, 4) in which as many held points are `found` (N, 2) px as should be.
+        """The share of the view from a pose (4, 4) where as many reference points are `found` (N, 2) px as should be.
 
         Fewer should be where their windows change much. Every cell of the image counts, not every point: a ceiling has
         many, and looks the same from lamp to lamp.
@@ -165,7 +165,7 @@ class Follower:
         wanted: F64 = np.asarray(np.bincount(cell, np.exp(-np.nanmin(change, axis=0)), cells), np.float64)
         views = [wanted]
         if seen is not None:
-            distance = np.linalg.norm(se3.transform(se3.inverse(pose), self.held.tracks.points()[visible]), axis=1)
+            distance = np.linalg.norm(se3.transform(se3.inverse(pose), self.reference.tracks.points()[visible]), axis=1)
             nearest = np.full(cells, np.inf)
             np.minimum.at(nearest, cell, distance)
             at = self._cells(self._camera.project(seen))
@@ -181,11 +181,11 @@ class Follower:
         return np.asarray(row * GRID[0] + column)
 
     def _seen_from(self, pose: F64) -> tuple[F64, F64]:
-        """Pixels (N, 2) of the held points, NaN behind the camera, and their deformations since (3, N, 2, 2)."""
-        held, tracks = self.held, self.held.tracks
+        """Pixels (N, 2) of the reference points, NaN behind the camera, and their deformations since (3, N, 2, 2)."""
+        reference, tracks = self.reference, self.reference.tracks
         if self._view is None or self._view[0] is not tracks or not np.array_equal(self._view[1], pose):
             uv = self._shutter.project(pose, np.zeros(6), tracks.points(), tracks.uv)
-            warps = plane_warps(self._camera, held.surfaces(self._camera), se3.inverse(pose) @ held.pose)
+            warps = plane_warps(self._camera, reference.surfaces(self._camera), se3.inverse(pose) @ reference.pose)
             self._view = tracks, pose, uv, warps
         return self._view[2:]
 
@@ -299,9 +299,9 @@ class Follower:
         return np.flatnonzero(textured), slots[textured]
 
     def keep_only(self, tracks: Tracks) -> None:
-        """Drop the first appearances of all points that are neither in `tracks` nor held."""
-        held = tracks.slot if self._held is None else self._held.tracks.slot
-        self._patches.keep_only(np.concatenate([tracks.slot, held]))
+        """Drop the first appearances of all points that are neither in `tracks` nor of the reference image."""
+        reference = tracks.slot if self._reference is None else self._reference.tracks.slot
+        self._patches.keep_only(np.concatenate([tracks.slot, reference]))
 
 
 def _agreement(found: F64, wanted: F64, cells_needed: float) -> float:

@@ -19,8 +19,8 @@ from stereo_sfm.tracking.flow.consensus import (
     MIN_GROUP,
     MIN_OPEN_SHARE,
     MIN_WEIGHT,
-    SETTLED_S,
     STATIC_S,
+    SURE_S,
     WEIGHT_RATIO,
     beside_moving,
     in_group,
@@ -47,12 +47,12 @@ UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
 # A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
 # are static and of an unobstructed view, are believed whatever the motion.
-UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
+CONSISTENT_SHARE, CONSISTENT_OPEN = 0.8, 0.3
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
 # the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they move it
 # away: by 14 at most in 700 images of stores without people and of EuRoC. If by more than has 1 % of six degrees of
 # freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
-NEARER, PULL_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
+NEARER, SHIFT_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
@@ -122,7 +122,7 @@ class PoseSolution:
         return math.nan if self.reason else self.sigma_px * float(np.median(self.error[np.isfinite(self.error)]))
 
     @property
-    def undivided(self) -> bool:
+    def consistent(self) -> bool:
         """Whether most of the points that were found agree."""
         return self.inliers >= AGREEING_SHARE * len(self.error)
 
@@ -191,8 +191,8 @@ class FramePoseSolver:
         if known is None:
             return None
         near = static & ~known & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[known]))
-        near = self._pulling(tracks, near, MIN_GROUP, best)
-        doubtful = self._pulling(tracks, doubtful, 1, best)
+        near = self._shifting(tracks, near, MIN_GROUP, best)
+        doubtful = self._shifting(tracks, doubtful, 1, best)
         suspected = near | doubtful
         if not suspected.any():
             return None
@@ -209,16 +209,16 @@ class FramePoseSolver:
 
     def _known(self, tracks: Tracks, static: Bool, seconds: float) -> Bool | None:
         """(N,) the `static` points (N,) that were tracked longest; None: too few."""
-        for least_s in (STATIC_S, SETTLED_S):
+        for least_s in (STATIC_S, SURE_S):
             known = static & (tracks.age * seconds >= least_s)
             if np.count_nonzero(known) >= 2 * self._config.min_features:
                 return known
         return None
 
-    def _pulling(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
+    def _shifting(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
         """(N,) the `points` (N,), if they are so many and shift the pose from where all others have it; else none."""
-        pulling = np.count_nonzero(points) >= least and self.pull(tracks.keep(points), best) >= PULL_CHI2
-        return points & pulling
+        shifting = np.count_nonzero(points) >= least and self.shift_chi2(tracks.keep(points), best) >= SHIFT_CHI2
+        return points & shifting
 
     def _judge(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, before: int
@@ -242,7 +242,7 @@ class FramePoseSolver:
             return chosen
         if undisturbed and self._confirmed(best, static & tracks.mapped, 2 * self._config.min_features):
             return best
-        known = static & (tracks.mapped | (tracks.age * expected.seconds >= SETTLED_S))
+        known = static & (tracks.mapped | (tracks.age * expected.seconds >= SURE_S))
         usual = self._likelihood(chosen.pose, expected) > USUAL_LIKELIHOOD
         if usual and self._confirmed(chosen, known, MIN_GROUP):
             return chosen
@@ -267,13 +267,13 @@ class FramePoseSolver:
         static = ~tracks.moving
         other = self._solve_rest(tracks, expected, last_pose, rest)
         agreed = None if best.reason else self._refit(tracks, expected, best, best.inlier & static, static)
-        by_settled, by_near = (solve(tracks, expected, static) for solve in (self._solve_settled, self._solve_near))
-        found = [agreed, by_settled, other, by_near]
+        by_static, by_near = (solve(tracks, expected, static) for solve in (self._solve_static, self._solve_near))
+        found = [agreed, by_static, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
         if not plausible:
             agree = int((best.inlier & static & tracks.mapped).sum())
-            undivided = agree >= max(UNDIVIDED_SHARE * int(static.sum()), UNDIVIDED_OPEN * self.open_view)
-            return best if undivided or not self.alert else _no_pose(len(tracks), "no_consensus")
+            consistent = agree >= max(CONSISTENT_SHARE * int(static.sum()), CONSISTENT_OPEN * self.open_view)
+            return best if consistent or not self.alert else _no_pose(len(tracks), "no_consensus")
         weights = [self._support(tracks, s, expected) for s in plausible]
         k = int(np.argmax(weights))
         chosen = plausible[0] if weights[k] <= WEIGHT_RATIO * weights[0] else plausible[k]
@@ -289,7 +289,7 @@ class FramePoseSolver:
         """Of a pose, by the static points that agree, those tracked longest most, and by the expected motion."""
         if solution.reason:
             return 0.0
-        weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + MIN_WEIGHT
+        weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SURE_S) / SURE_S + MIN_WEIGHT
         agree = float((weight * solution.agreement)[~tracks.moving].sum())
         return agree * self._likelihood(solution.pose, expected)
 
@@ -307,12 +307,14 @@ class FramePoseSolver:
             best.reason = "no_consensus"
         return best
 
-    def _solve_settled(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
+    def _solve_static(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
         """Solve with the points that have been static for long, then with all their inliers; None with too few."""
-        settled = static & (tracks.age * expected.seconds >= SETTLED_S)
-        if settled.sum() < self._config.min_features or settled[static].all():
+        surely_static = static & (tracks.age * expected.seconds >= SURE_S)
+        if surely_static.sum() < self._config.min_features or surely_static[static].all():
             return None
-        return self._refit(tracks, expected, self._optimise(tracks, expected, settled, expected), settled, static)
+        return self._refit(
+            tracks, expected, self._optimise(tracks, expected, surely_static, expected), surely_static, static
+        )
 
     def _solve_near(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
         """Solve with the points that are about where the predicted motion takes them; None with too few."""
@@ -341,7 +343,7 @@ class FramePoseSolver:
         by_others = self._optimise(tracks, expected.to(pose.pose), agree & ~alone)
         if (self.influence(tracks.keep(alone), by_others)[1] >= self._config.max_error_sigmas).any():
             return self._optimise(tracks, expected.to(by_others.pose), static & ~alone)
-        new = alone & (tracks.age * expected.seconds < SETTLED_S)
+        new = alone & (tracks.age * expected.seconds < SURE_S)
         if not new.any() or math.sqrt(np.trace(by_others.covariance[:3, :3])) > KNOWN_M:
             return pose
         return self._optimise(tracks, expected.to(by_others.pose), agree & ~new)
@@ -411,12 +413,12 @@ class FramePoseSolver:
 
         While none is known for so long, from the inliers, unless objects move.
         """
-        settled = ~tracks.moving & (tracks.age * seconds >= SETTLED_S) & np.isfinite(solution.error)
-        if np.count_nonzero(settled) < 2 * self._config.min_features:
-            settled = solution.inlier
-            if self.alert or not settled.any():
+        surely_static = ~tracks.moving & (tracks.age * seconds >= SURE_S) & np.isfinite(solution.error)
+        if np.count_nonzero(surely_static) < 2 * self._config.min_features:
+            surely_static = solution.inlier
+            if self.alert or not surely_static.any():
                 return
-        noise = self._noise * (0.9 + 0.1 * median(solution.error[settled]) / MEDIAN_ERROR)
+        noise = self._noise * (0.9 + 0.1 * median(solution.error[surely_static]) / MEDIAN_ERROR)
         self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
 
     def forget(self) -> None:
@@ -445,9 +447,9 @@ class FramePoseSolver:
             CAUCHY_SCALES[-1],
         )  # fmt: skip
 
-    def pull(self, tracks: Tracks, solution: PoseSolution) -> float:
-        """`pose_solver.pull` of some points."""
-        return pose_solver.pull(
+    def shift_chi2(self, tracks: Tracks, solution: PoseSolution) -> float:
+        """`pose_solver.shift_chi2` of some points."""
+        return pose_solver.shift_chi2(
             solution.pose, solution.velocity, solution.covariance, self._seen(tracks), self.cameras, solution.sigma_px,
             CAUCHY_SCALES[-1],
         )  # fmt: skip

@@ -10,11 +10,11 @@ import math
 
 import numpy as np
 
-from stereo_sfm.tracking.flow.follower import Held
+from stereo_sfm.tracking.flow.follower import ReferenceImage
 from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, within
 from stereo_sfm.types import F64
 
-MORE_RECALL = 0.15  # by which more of the held points must be found than before
+MORE_RECALL = 0.15  # by which more of the reference points must be found than before
 LASTS_NS = 1_000_000_000
 UNCERTAIN_M = 0.02  # standard deviation of a position that new points should not inherit
 CONTRADICTED_SIGMAS = 3.0  # between two positions of which one must be wrong
@@ -24,29 +24,29 @@ class PartialView:
     """The last pose from a part of the view."""
 
     def __init__(self) -> None:
-        self._held: Held | None = None
+        self._reference: ReferenceImage | None = None
         self._recall, self._sigma_m = 1.0, 0.0
         self._until_ns = 0
 
-    def begin(self, held: Held, recall: float, covariance: F64, stamp_ns: int) -> None:
-        """A pose was found at a time, with that share of the held points; with a sufficient one it stays.
+    def begin(self, reference: ReferenceImage, recall: float, covariance: F64, stamp_ns: int) -> None:
+        """A pose was found at a time, with that share of the reference points; with a sufficient one it stays.
 
         `covariance`: (6, 6) of the pose.
         """
-        self._held = held
+        self._reference = reference
         self._recall, self._sigma_m, self._until_ns = recall, _sigma_m(covariance), stamp_ns + LASTS_NS
         self.end(recall)
 
-    def wanted(self, held: Held, stamp_ns: int) -> bool:
-        """Whether to look for more points: not for long, and not in an image that was held since."""
-        return held is self._held and stamp_ns <= self._until_ns
+    def wanted(self, reference: ReferenceImage, stamp_ns: int) -> bool:
+        """Whether to look for more points: not for long, and not in an image that became the reference since."""
+        return reference is self._reference and stamp_ns <= self._until_ns
 
-    def uncertain(self, held: Held, covariance: F64, stamp_ns: int) -> bool:
+    def uncertain(self, reference: ReferenceImage, covariance: F64, stamp_ns: int) -> bool:
         """Whether a pose with covariance (6, 6) still depends on that part, and is too uncertain for new points."""
-        return self.wanted(held, stamp_ns) and _sigma_m(covariance) > UNCERTAIN_M
+        return self.wanted(reference, stamp_ns) and _sigma_m(covariance) > UNCERTAIN_M
 
     def improved(self, before: F64, after: F64, recall: float, covariance: F64) -> bool:
-        """Whether a pose (4, 4) by a share of the held points replaces the one that it was looked for from.
+        """Whether a pose (4, 4) by a share of the reference points replaces the one that it was looked for from.
 
         More of a view that the camera drives out of may be fewer points: their pose (`covariance` (6, 6)) is no better.
         """
@@ -57,9 +57,9 @@ class PartialView:
         return contradicted or sigma_m < self._sigma_m
 
     def end(self, recall: float) -> None:
-        """Nothing more is to be found once a sufficient share of the held points was."""
+        """Nothing more is to be found once a sufficient share of the reference points was."""
         if recall >= SUFFICIENT_RECALL:
-            self._held = None
+            self._reference = None
 
 
 def _sigma_m(covariance: F64) -> float:

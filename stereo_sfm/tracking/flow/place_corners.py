@@ -43,7 +43,7 @@ class PlaceCorners:
         self._stereo.use(rig)
 
     @staticmethod
-    def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
+    def from_config(config: Config, rig: Rig) -> PlaceCorners | None:
         """The detector of a run, None without place recognition or without depth."""
         needed = config.mapper.enabled or config.loop.enabled
         return PlaceCorners(config, rig) if rig.stereo and needed else None

@@ -332,7 +332,7 @@ def influence(pose, velocity, covariance, points, cameras, sigma, scale):
     rho, variance = points.rho, points.variance
     res, jac, ray, seen = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros((4, 4))
     row, step = pose.copy(), np.zeros((4, 4))
-    freedoms, errors = np.zeros(len(rho)), np.full(len(rho), np.inf)
+    leverages, errors = np.zeros(len(rho)), np.full(len(rho), np.inf)
     spread, left, factor, white = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4)
     for k in range(len(rho)):
         rows = _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray)
@@ -352,19 +352,19 @@ def influence(pose, velocity, covariance, points, cameras, sigma, scale):
         for a in range(4):
             for b in range(4):
                 chi2 += left[a, b] * res[a] * res[b]
-                freedoms[k] += left[a, b] * seen[a, b]
+                leverages[k] += left[a, b] * seen[a, b]
                 spread[a, b] += seen[a, b]
-        freedoms[k] /= 1.0 + chi2 / (rows * scale * scale)
+        leverages[k] /= 1.0 + chi2 / (rows * scale * scale)
         if solve_symmetric(spread, res, white, factor):
             total = 0.0
             for a in range(4):
                 total += res[a] * white[a]
             errors[k] = math.sqrt(max(total, 0.0) / rows)
-    return freedoms, errors
+    return leverages, errors
 
 
 @njit
-def pull(pose, velocity, covariance, points, cameras, sigma, scale):
+def shift_chi2(pose, velocity, covariance, points, cameras, sigma, scale):
     """How far from a pose, with covariance (6, 6), the others alone would have it than some `points`, in squared
     sigmas; inf if it rests on these.
 

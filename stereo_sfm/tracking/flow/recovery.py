@@ -1,4 +1,4 @@
-"""Recovery after a loss of tracking: prediction, test whether the view is free, relocalization."""
+"""Recovery after a loss of tracking: prediction, test whether the view is unobstructed, relocalization."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.motion_prior import Expectation, MotionPrior
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.tracks import Tracks
-from stereo_sfm.tracking.flow.trusted_motion import Expectation, TrustedMotion
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
@@ -32,9 +32,9 @@ MIN_INLIER_SHARE = 0.6  # of the points that are found
 # where lamps are taken for the next ones, have 0.43 to 0.64; right poses after 3 to 4 m without sight 0.69 to 0.84.
 MIN_RECALL, RECALL_PER_METRE, RECALL_PER_SIGMA = 0.1, 0.7, 0.1
 MAX_SIGMA_M = 0.8
-# Of the cells with corners in the newest keyframes, row by row, with which the view is free again. An open one has 0.63
+# Of the cells with corners in the newest keyframes, row by row, with which the view is open again. An open one has 0.63
 # of them at least, also after a turn; the rim around a cover 0.47 at most, although it has half as many cells.
-FREE_SHARE = 0.5
+OPEN_SHARE = 0.5
 
 
 class Recovery:
@@ -47,8 +47,8 @@ class Recovery:
         self._rows: F64 = np.zeros(GRID[1])  # cells of each row in which the newest keyframes had corners further away
         self._cells = 0.0  # number of them in one keyframe
         self._next = 0  # of the other motions
-        self.motion = TrustedMotion()
-        self.free = True  # whether the last searched image has corners in most of the cells of each row
+        self.motion = MotionPrior()
+        self.unobstructed = True  # whether the last searched image has corners in most of the cells of each row
 
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
@@ -73,8 +73,8 @@ class Recovery:
         if self._places is None or self._place_corners is None:
             return
         corners = self._place_corners.find_in(images.left, images.right)
-        self.free = bool(np.minimum(self._occupied(corners), self._rows).sum() >= FREE_SHARE * self._cells)
-        if self.free and expected.sigma_m > UNCERTAIN_M:
+        self.unobstructed = bool(np.minimum(self._occupied(corners), self._rows).sum() >= OPEN_SHARE * self._cells)
+        if self.unobstructed and expected.sigma_m > UNCERTAIN_M:
             straight, *others = self.motion.others(image.stamp_ns)
             yield from (self.motion.steady(image.stamp_ns).odom_T_cam, straight)
             yield from (others[(self._next + k) % len(others)] for k in range(MOTIONS_AT_ONCE))

@@ -66,7 +66,7 @@ class SideViews:
         self._last: tuple[int, F64, float] | None = None  # newest: submap, odom_T_cam, distance to the shelves
 
     @staticmethod
-    def wanted(config: Config, rig: Rig) -> SideViews | None:
+    def from_config(config: Config, rig: Rig) -> SideViews | None:
         """The views of a run; None without place recognition or without depth."""
         needed = config.mapper.enabled or config.loop.enabled
         return SideViews(config, rig) if rig.stereo and needed and config.loop.side_corners else None

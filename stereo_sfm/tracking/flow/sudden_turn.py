@@ -52,7 +52,7 @@ class SuddenTurns:
         self._said: F64 = np.zeros(3)  # `turn` of the last news
 
     @staticmethod
-    def wanted(config: Config, rig: Rig) -> SuddenTurns | None:
+    def from_config(config: Config, rig: Rig) -> SuddenTurns | None:
         """Those of a run; None where the mapper does not correct the rig."""
         corrects = config.self_calibration.mode == "auto" and config.mapper.enabled
         return SuddenTurns() if corrects and rig.second_camera is not None else None

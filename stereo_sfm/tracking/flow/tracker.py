@@ -29,6 +29,7 @@ from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver,
 from stereo_sfm.tracking.flow.keyframes import Keyframes
 from stereo_sfm.tracking.flow.loss import Loss
 from stereo_sfm.tracking.flow.map_points import take_update
+from stereo_sfm.tracking.flow.motion_prior import Expectation
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
@@ -41,7 +42,6 @@ from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
 from stereo_sfm.tracking.flow.tracks import Tracks
-from stereo_sfm.tracking.flow.trusted_motion import Expectation
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.protocol import Places
@@ -56,11 +56,11 @@ TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agre
 TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
-UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on; an image is held for then
-HOLD_NS = 200_000_000  # from one image that may be held to the next
+UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on
+REFERENCE_NS = 200_000_000  # from one image that may become the reference to the next
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
-HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
+REFERENCE_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
 FOLLOWED_S = 0.5  # without a pose: with 2 m/s^2, a robot is a quarter of a metre from where it was expected
@@ -100,7 +100,7 @@ class Tracker:
         self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter, self._movers)
         self._keyframes = Keyframes(config, self._shutter, place_corners, side_views, self._movers)
         self._sensors = MotionSensors.of(config, rig)
-        self._held_ns = -HOLD_NS  # the last image that might have been held
+        self._reference_ns = -REFERENCE_NS  # the last image that might have become the reference
         self._recovery = Recovery(place_corners, places, rig.left.size)
         self._tracks = Tracks()
         self._state = TrackState.INITIALIZING
@@ -172,12 +172,12 @@ class Tracker:
         trusted = self._trusted(tracks, solution)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
-            self._hold(image, images, tracks, solution)
+            self._renew_reference(image, images, tracks, solution)
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
-        uncertain = self._part.uncertain(self._follower.held, solution.covariance, image.stamp_ns)
-        if self._recovery.free or not uncertain:
+        uncertain = self._part.uncertain(self._follower.reference, solution.covariance, image.stamp_ns)
+        if self._recovery.unobstructed or not uncertain:
             if recovered or self._keyframes.due(self._tracks):
                 keyframe = self._create_keyframe(image, images, solution.covariance, trusted)
             if keyframe is not None or self._solver.crowded(self._static_count()):
@@ -237,7 +237,7 @@ class Tracker:
         """
         placed = self._tracks.keep(self._tracks.mapped)
         solution = self._solver.solve_again(placed, ExpectedMotion(self._pose, np.zeros(6), 0.0))
-        if not solution.reason and solution.undivided:
+        if not solution.reason and solution.consistent:
             self._resumed_T_odom = self._pose @ se3.inverse(solution.pose) @ self._resumed_T_odom
             self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
 
@@ -297,8 +297,8 @@ class Tracker:
                 return tracks, solution
         self._follower.search_widely()
         blurred = self._track(images, turned, blurred=True)
-        undivided = blurred[1].good(self._config, self._static_count()) and blurred[1].undivided
-        return blurred if undivided else (tracks, solution)
+        consistent = blurred[1].good(self._config, self._static_count()) and blurred[1].consistent
+        return blurred if consistent else (tracks, solution)
 
     def _track(
         self, images: StereoPyramids, expected: ExpectedMotion, blurred: bool = False
@@ -396,8 +396,8 @@ class Tracker:
         keyframe = self._create_keyframe(image, images, covariance, True)
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
-        self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose, self._pose)
-        self._held_ns = image.stamp_ns
+        self._follower.refer_to(images, self._tracks, ~self._tracks.moving, self._pose, self._pose)
+        self._reference_ns = image.stamp_ns
         self._loss.begin(image.stamp_ns)
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         self._bridging = False
@@ -418,7 +418,7 @@ class Tracker:
 
     def _search(self, image: StereoImage, images: StereoPyramids) -> tuple[Tracks, PoseSolution]:
         """Relocalize a lost camera with the points of the last trusted image, from several hypotheses of its pose."""
-        self._hold_more()
+        self._add_to_reference()
         bridge = self._bridge(image.stamp_ns)
         expected = self._expect(image.stamp_ns, bridge)
         steady = self._recovery.motion.steady(image.stamp_ns) if bridge is None else None
@@ -443,12 +443,12 @@ class Tracker:
         if best is None:
             return NOT_FOUND
         tracks, solution, recall = best
-        self._part.begin(self._follower.held, recall, solution.covariance, image.stamp_ns)
+        self._part.begin(self._follower.reference, recall, solution.covariance, image.stamp_ns)
         return tracks, solution
 
     def _find_more(self, image: StereoImage, images: StereoPyramids, pose: F64) -> tuple[Tracks, PoseSolution] | None:
         """Relocalize again, near a pose (4, 4) from a part of the view, once more is free; None if no more is found."""
-        if not self._part.wanted(self._follower.held, image.stamp_ns):
+        if not self._part.wanted(self._follower.reference, image.stamp_ns):
             return None
         tracks, solution = self._track_from(pose, images, (image.stamp_ns - self._stamp_ns) * 1e-9)
         if solution.reason:
@@ -457,7 +457,7 @@ class Tracker:
         if not self._part.improved(pose, solution.pose, recall, solution.covariance):
             self._part.end(recall)
             return None
-        self._part.begin(self._follower.held, recall, solution.covariance, image.stamp_ns)
+        self._part.begin(self._follower.reference, recall, solution.covariance, image.stamp_ns)
         return tracks, solution
 
     def _recall(self, tracks: Tracks, solution: PoseSolution) -> float:
@@ -484,21 +484,27 @@ class Tracker:
             pose, known = solution.pose, ()
         return tracks, solution
 
-    def _hold(self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution) -> None:
+    def _renew_reference(
+        self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution
+    ) -> None:
         """Keep an image to recover from, if it is better than the one before; asked of few images, which takes time."""
-        if image.stamp_ns - self._held_ns >= HOLD_NS and not self._part.wanted(self._follower.held, image.stamp_ns):
-            self._held_ns = image.stamp_ns
+        if image.stamp_ns - self._reference_ns >= REFERENCE_NS and not self._part.wanted(
+            self._follower.reference, image.stamp_ns
+        ):
+            self._reference_ns = image.stamp_ns
             later = self._recovery.motion.steady(image.stamp_ns + UNSEEN_NS).odom_T_cam
-            self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose, later)
+            self._follower.refer_to(images, tracks, solution.inlier & ~tracks.moving, solution.pose, later)
 
-    def _hold_more(self) -> None:
+    def _add_to_reference(self) -> None:
         """Add points to the reference image: from far away most of those that were tracked are out of view."""
-        held = self._follower.held
-        if not held.dense:
-            most = HELD_POINTS * self._config.max_features
-            tracks = self._follower.renewed(held)
-            tracks = self._new_points.add(tracks, held.images, held.pose, np.zeros(6), most, moving_neighbours=1)
-            held.add(tracks.keep(~tracks.moving))
+        reference = self._follower.reference
+        if not reference.dense:
+            most = REFERENCE_POINTS * self._config.max_features
+            tracks = self._follower.renewed(reference)
+            tracks = self._new_points.add(
+                tracks, reference.images, reference.pose, np.zeros(6), most, moving_neighbours=1
+            )
+            reference.add(tracks.keep(~tracks.moving))
             self._follower.keep_only(self._tracks)
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
@@ -507,7 +513,7 @@ class Tracker:
         expected = self._expect(image.stamp_ns, bridge)
         self._follower.search_widely()
         dark = image.left.max() < DARK
-        if self._loss.add(image.stamp_ns, self._stamp_ns, bridge is None or not dark, self._recovery.free):
+        if self._loss.add(image.stamp_ns, self._stamp_ns, bridge is None or not dark, self._recovery.unobstructed):
             self._pose = expected.odom_T_cam
             self._velocity = self._recovery.motion.velocity_at(image.stamp_ns)
             self._solver.forget()
@@ -517,7 +523,7 @@ class Tracker:
             self._state = TrackState.INITIALIZING
             if not self._bridging:
                 self._recovery.motion.forget()
-        covered = not self._recovery.free and not dark
+        covered = not self._recovery.unobstructed and not dark
         state = TrackState.OCCLUDED if covered else TrackState.LOST
         state = state if bridge is None else TrackState.INERTIAL
         covariance = expected.covariance if bridge is None else bridge[1]

@@ -52,7 +52,7 @@ class Expectation:
         return max(float(metres) / self.sigma_m, float(radians) / self.sigma_rad)
 
 
-class TrustedMotion:
+class MotionPrior:
     """The trusted poses of the last second."""
 
     def __init__(self) -> None:
