@@ -83,8 +83,8 @@ RULES = (
     _rule(
         "alert for a second",
         SOLVER,
-        "ALERT_S if moving else max(self._alert_s - seconds, 0.0)",
-        "ALERT_S if moving else 0.0",
+        "STATIC_S if moving else max(self._alert_s - seconds, 0.0)",
+        "STATIC_S if moving else 0.0",
     ),
     _rule(
         "prior of long-static points",
@@ -217,7 +217,7 @@ RULES = (
     _rule(
         "a trusted pose",
         TRACKER,
-        "return agree >= max(TRUSTED_SHARE * int(np.count_nonzero(~tracks.moving)), enough)",
+        "return agree >= max(MOST * int(np.count_nonzero(~tracks.moving)), enough)",
         "return True",
     ),
     _rule("search in three rounds", TRACKER, "for reach, most in ROUNDS:", "for reach, most in ROUNDS[::2]:"),

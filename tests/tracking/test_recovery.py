@@ -175,8 +175,8 @@ def test_a_turn_is_not_predicted_to_go_on_for_long() -> None:
     assert se3.extent(straight)[1] < 1e-9
     assert min(float(se3.extent(other)[0]) for other in others) < 1e-9  # it stops
     turns = [float(se3.log(other)[4]) for other in others]
-    assert max(turns) > 2.5  # at most a radian a second
-    assert min(turns) < -2.5
+    assert max(turns) > 2.4  # half a turn is possible
+    assert min(turns) < -2.4
 
 
 @pytest.mark.parametrize(("recall", "seconds", "accepted"), [(0.64, 2.0, False), (0.69, 2.0, True), (0.2, 0.3, True)])

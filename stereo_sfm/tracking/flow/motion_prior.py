@@ -1,6 +1,7 @@
 """Prediction of the pose during a loss of tracking, from the motion of the last good second.
 
-The covariance grows with the possible accelerations and turns of a robot.
+Speed and turn rate return to zero, driven by random accelerations (an Ornstein-Uhlenbeck process; Gardiner, Handbook of
+Stochastic Methods, 1985, section 4.4.4): the mean of the pose and its covariance follow from the two spreads and times.
 """
 
 from __future__ import annotations
@@ -15,16 +16,14 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 WINDOW_S = 1.0  # of motion whose mean is the velocity
-FADE_S, TURN_FADE_S = 4.0, 1.0  # time constants with which the predicted speed and turn rate decrease
-ACCELERATION = 0.5  # m/s^2, standard deviation of a robot's acceleration
-MAX_SPEED_CHANGE = 0.5  # m/s
-TURN_ACCELERATION = 1.0  # rad/s^2, standard deviation
-MAX_TURN_RATE_CHANGE = 0.7  # rad/s
-MAX_TURN_RATE, TURN_STEP = 1.0, np.deg2rad(20.0)  # rad/s, radians: turns that are tried
-STEADY_SPEED, STEADY_TURN_RATE = 0.05, 0.05  # m/s, rad/s, standard deviations of a motion that goes on as before
+# Of a robot's speed and turn rate: seconds in which they return to zero, and root mean squares, m/s and rad/s. Robots
+# in stores drive 0.3 to 1.2 m/s; a turn by 90 degrees takes 1.5 to 3 s.
+RETURN_S, SPREAD = np.array([4.0, 1.0]), np.array([0.8, 0.7])
+FIRST_SIGMAS = np.array([0.01, 0.005])  # metres, radians: of the last trusted pose and its velocity
+STEADY = np.array([0.05, 0.05])  # m/s, rad/s, standard deviations of a motion that goes on as before
+TURN_STEP = np.deg2rad(20.0)  # radians between turns that are tried: corners of two thirds of the view stay in it
 SLOWER = 0.5, 0.0  # shares of the last speed that are tried
-UNKNOWN_SPEED, UNKNOWN_TURN_RATE = 1.0, 0.5  # m/s, rad/s, standard deviations before any motion was seen
-FIRST_SIGMAS = (0.01, 0.005)  # metres, radians: of the last trusted pose and its velocity
+TURNS = 2.0  # standard deviations of the turn up to which turns are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +37,13 @@ class Expectation:
     @staticmethod
     def of(odom_T_cam: F64, covariance: F64) -> Expectation:
         """A pose (4, 4) with the covariance (6, 6) of pose @ exp(xi)."""
-        metres, radians = (math.sqrt(np.trace(covariance[k : k + 3, k : k + 3]) / 3) for k in (0, 3))
-        return Expectation(odom_T_cam, FIRST_SIGMAS[0] + metres, FIRST_SIGMAS[1] + radians)
+        return Expectation.around(odom_T_cam, np.sqrt(np.diag(covariance).reshape(2, 3).mean(1)))
+
+    @staticmethod
+    def around(odom_T_cam: F64, sigmas: F64) -> Expectation:
+        """A pose (4, 4) with standard deviations (2,) metres and radians since the last trusted one."""
+        metres, radians = FIRST_SIGMAS + sigmas
+        return Expectation(odom_T_cam, float(metres), float(radians))
 
     @property
     def covariance(self) -> F64:
@@ -77,29 +81,21 @@ class MotionPrior:
 
     def velocity_at(self, stamp_ns: int) -> F64:
         """(6,) the velocity at a later time: the last one, decreased exponentially."""
-        seconds = max((stamp_ns - self._poses[-1][0]) * 1e-9, 0.0)
-        return self.velocity() * np.exp(-seconds / np.repeat([FADE_S, TURN_FADE_S], 3))
+        return self.velocity() * np.repeat(np.exp(-self._seconds(stamp_ns) / RETURN_S), 3)
 
     def expect(self, stamp_ns: int) -> Expectation:
         """The predicted pose at a time, with the last speed and turn rate decreasing exponentially."""
-        last_ns, last = self._poses[-1]
-        seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
-        moved = self.velocity()
-        moved[:3] *= _faded(seconds, FADE_S)
-        moved[3:] *= _faded(seconds, TURN_FADE_S)
-        metres = min(0.5 * ACCELERATION * seconds, MAX_SPEED_CHANGE) * seconds
-        radians = min(0.5 * TURN_ACCELERATION * seconds, MAX_TURN_RATE_CHANGE) * seconds
-        if self._poses[0][0] == last_ns:
-            metres, radians = metres + UNKNOWN_SPEED * seconds, radians + UNKNOWN_TURN_RATE * seconds
-        return Expectation(last @ se3.exp(moved), FIRST_SIGMAS[0] + metres, FIRST_SIGMAS[1] + radians)
+        (last_ns, last), periods = self._poses[-1], self._seconds(stamp_ns) / RETURN_S
+        gone = -np.expm1(-periods)  # share of a speed that is gone
+        sigmas = SPREAD * RETURN_S * np.sqrt(np.maximum(2 * (periods - gone) - gone**2, 0.0))
+        if self._poses[0][0] == last_ns:  # and the speed is unknown
+            sigmas = SPREAD * RETURN_S * np.sqrt(2 * (periods - gone))
+        return Expectation.around(last @ se3.exp(self.velocity() * np.repeat(RETURN_S * gone, 3)), sigmas)
 
     def steady(self, stamp_ns: int) -> Expectation:
         """The pose at a time if the robot goes on straight at its speed, which most do most of the time."""
-        last_ns, last = self._poses[-1]
-        seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
-        forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * seconds
-        sigmas = FIRST_SIGMAS[0] + STEADY_SPEED * seconds, FIRST_SIGMAS[1] + STEADY_TURN_RATE * seconds
-        return Expectation(last @ se3.exp(forward), *sigmas)
+        seconds = self._seconds(stamp_ns)
+        return Expectation.around(self._poses[-1][1] @ se3.exp(self._forward() * seconds), STEADY * seconds)
 
     def others(self, stamp_ns: int) -> list[F64]:
         """Poses (4, 4) at a time after other motions that a robot is capable of, on arcs; the straight one first.
@@ -108,16 +104,17 @@ class MotionPrior:
 
         The camera is taken to be upright: a robot turns about its y axis.
         """
-        last_ns, last = self._poses[-1]
-        seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
-        fade = _faded(seconds, FADE_S)
-        forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * fade
-        turns = np.arange(TURN_STEP, min(MAX_TURN_RATE * seconds, math.pi) + 0.5 * TURN_STEP, TURN_STEP)
+        forward = self._forward() * RETURN_S[0] * -math.expm1(-self._seconds(stamp_ns) / RETURN_S[0])
+        most = min(TURNS * self.expect(stamp_ns).sigma_rad, math.pi)
+        turns = np.arange(TURN_STEP, most + 0.5 * TURN_STEP, TURN_STEP)
         arcs = [(1.0, side * turn) for turn in turns.tolist() for side in (1.0, -1.0)]
         motions = [(1.0, 0.0), *((speed, 0.0) for speed in SLOWER), *arcs]
-        return [last @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]
+        return [self._poses[-1][1] @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]
 
+    def _seconds(self, stamp_ns: int) -> float:
+        """Since the last trusted pose."""
+        return max((stamp_ns - self._poses[-1][0]) * 1e-9, 0.0)
 
-def _faded(seconds: float, constant: float) -> float:
-    """Seconds at the first velocity that move as far as these at one that decreases exponentially."""
-    return -constant * math.expm1(-seconds / constant)
+    def _forward(self) -> F64:
+        """(6,) the velocity without its turning."""
+        return self.velocity() * ([1.0] * 3 + [0.0] * 3)
