@@ -207,7 +207,12 @@ RULES = (
         "np.minimum(self._occupied(corners), self._rows).sum()",
         "self._occupied(corners).sum()",
     ),
-    _rule("occluded time counts a tenth", LOSS, "max(self._unobstructed_s, OCCLUDED_SHARE * self._occluded_s)", "self._unobstructed_s"),
+    _rule(
+        "occluded time counts a tenth",
+        LOSS,
+        "max(self._unobstructed_s, OCCLUDED_SHARE * self._occluded_s)",
+        "self._unobstructed_s",
+    ),
     _rule(
         "recent places",
         RECOVERY,
