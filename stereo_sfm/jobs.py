@@ -87,12 +87,18 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
                     try:
                         result: Result = ray.get(reference)
                     except RayError as error:
-                        result = {"ok": False, "error": f"the task died: {error}".splitlines()[0]}
+                        result = {"ok": False, "error": f"the task died: {_why(error)}"}
                     results[job.name] = result
                     yield job, result
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
+
+
+def _why(error: Exception) -> str:
+    """One line of an error of Ray: the last of a traceback, the first of a death."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return lines[-1 if hasattr(error, "traceback_str") else 0].strip() if lines else type(error).__name__
 
 
 def _check_memory(nodes: Sequence[Mapping[str, Any]], wanted: int) -> None:
