@@ -22,6 +22,8 @@ from stereo_sfm.errors import StereoSfmError, require
 
 # Ray's own switch for a single computer: all its ports are on the loopback address.
 LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+# A node whose agents take more than 15 s to start ends itself, and no setting of Ray changes these seconds.
+STARTS = 3  # tries on a busy computer
 GRACE = 1.2  # of its time, after which a job that does not react is ended with its worker
 
 Result = dict[str, Any]
@@ -120,13 +122,36 @@ def _ray(address: str | None) -> Generator[Any]:
 
     ours = not ray.is_initialized()
     if ours:
-        # Always "local": otherwise Ray waits for the last cluster that it knows, even if that is gone.
-        ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        _start(ray, address)
     try:
         yield ray
     finally:
         if ours:
             ray.shutdown()
+
+
+def _start(ray: Any, address: str | None) -> None:
+    """Connect, or start a cluster of this computer alone.
+
+    Raises:
+        StereoSfmError: it does not start.
+    """
+    options: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.ERROR}
+    if address is not None:
+        ray.init(address=address, **options)
+        return
+    for attempt in range(STARTS):
+        try:
+            # Not None: otherwise Ray waits for the last cluster that it knows, even if that is gone.
+            ray.init(address="local", **options)
+            return
+        except Exception as error:  # Ray raises nothing narrower
+            ray.shutdown()
+            if attempt == STARTS - 1:
+                raise StereoSfmError(
+                    f"Ray does not start on this computer ({str(error).splitlines()[0]}): "
+                    "try again when it is less busy, or name a cluster with --address"
+                ) from None
 
 
 def _within(work: Callable[..., Result], args: tuple[Any, ...], before: Mapping[str, Result], limits: Limits) -> Result:

@@ -26,6 +26,7 @@ from stereo_sfm.storage.remote import Remote
 TRIES = 12  # of a request: a tenth of failing answers makes an object fail once in 10^12
 PATIENCE_S = 180.0  # for all tries of a request: a server that stands still for 20 s costs nothing
 CONNECT_S, REQUEST_S = 5.0, 60.0
+EMULATOR = "STORAGE_EMULATOR_HOST"  # of Google's own libraries: the address of another server than theirs
 FULL = re.compile(r"QuotaExceeded|StorageFull|InsufficientStorage|\b507\b|No space left|os error 28\b", re.I)
 DENIED = re.compile(r"AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|Forbidden|\b40[13]\b|os error 13\b", re.I)
 NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|The specified bucket does not exist", re.I)
@@ -70,7 +71,10 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
 
         with contextlib.suppress(ValueError):  # boto3 knows none: the computer's own role is asked for
             options["credential_provider"] = Boto3CredentialProvider()
-    plain = os.environ.get("AWS_ENDPOINT_URL", "").startswith("http://")
+    emulator = os.environ.get(EMULATOR, "") if scheme == "gs" else ""
+    if emulator:
+        options |= {"base_url": emulator, "skip_signature": True}
+    plain = (emulator or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://")
     client = {"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=REQUEST_S)}
     options["client_options"] = {**client, **({"allow_http": True} if plain else {})}
     options["retry_config"] = {
