@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import json
 import os
 import re
 from collections.abc import Generator, Iterable
@@ -17,7 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.folder_lock import FolderLock
@@ -73,7 +74,15 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
             options["credential_provider"] = Boto3CredentialProvider()
     emulator = os.environ.get(EMULATOR, "") if scheme == "gs" else ""
     if emulator:
-        options |= {"base_url": emulator, "skip_signature": True}
+        options["service_account_key"] = json.dumps(
+            {
+                "gcs_base_url": emulator,
+                "disable_oauth": True,
+                "client_email": "",
+                "private_key": "",
+                "private_key_id": "",
+            }
+        )
     plain = (emulator or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://")
     client = {"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=REQUEST_S)}
     options["client_options"] = {**client, **({"allow_http": True} if plain else {})}
@@ -139,7 +148,12 @@ def read_tagged(remote: Remote) -> tuple[bytes, str]:
 
     with _one_line(remote, "read"):
         found = obstore.get(store, remote.key)
-        return bytes(found.bytes()), str(found.meta["e_tag"])
+        return bytes(found.bytes()), str(found.meta[_condition(remote)])
+
+
+def _condition(remote: Remote) -> Literal["version", "e_tag"]:
+    """What a conditional put compares."""
+    return "version" if remote.scheme == "gs" else "e_tag"
 
 
 def size_and_tag(remote: Remote) -> tuple[int, str]:
@@ -227,7 +241,8 @@ def _conditional(remote: Remote, data: bytes, tag: str | None) -> None:
         import obstore
 
         with _one_line(remote, "write"):
-            obstore.put(store, remote.key, data, mode="create" if tag is None else {"e_tag": tag}, use_multipart=False)
+            mode: Any = "create" if tag is None else {_condition(remote): tag}
+            obstore.put(store, remote.key, data, mode=mode, use_multipart=False)
     except (Changed, Unreachable):
         with contextlib.suppress(Missing):
             if read(remote) == data:
