@@ -11,7 +11,7 @@ import subprocess
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 BUCKET = "fleet"
@@ -32,7 +32,7 @@ def make_container(url: str) -> None:
 
 
 @contextmanager
-def server(program: str) -> Iterator[str]:
+def server(program: str) -> Generator[str]:
     """A server with the container BUCKET; its address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -6,7 +6,7 @@ Generations rise with every put, and a put is carried out only if the generation
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -103,7 +103,7 @@ class Handler(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def server() -> Iterator[str]:
+def server() -> Generator[str]:
     """A server with the bucket BUCKET; its address."""
     members = {"objects": dict[str, tuple[bytes, int]](), "lock": threading.Lock()}
     with ThreadingHTTPServer(("127.0.0.1", 0), type("OwnHandler", (Handler,), members)) as found:
