@@ -28,10 +28,13 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import _figures
 import psutil
+from _figures import Figure
 
 from stereo_sfm.config import Config
 from stereo_sfm.fleet.catalogue import ask, delta_bytes, opened
@@ -59,19 +62,23 @@ class Verdicts:
 
     def __init__(self) -> None:
         self.failed = 0
+        self.figures: list[Figure] = []
 
     def row(self, sentence: str, holds: bool, figure: str) -> None:
         self.failed += not holds
+        self.figures.append(Figure(sentence, "", f"{figure}: {'holds' if holds else 'does not hold'}"))
         print(f"| {sentence} | {figure} | {'PASS' if holds else 'FAIL'} |", flush=True)
 
 
-def make_sessions(folder: Path, nights: int, points: int) -> list[Path]:
+def make_sessions(folder: Path, nights: int, points: int, keyframes: int) -> list[Path]:
     """The maps that a robot makes in the same aisle, one a night."""
     out: list[Path] = []
     for night in range(nights):
         sequence = make_sequence([0], seed=5, noise_px=0.2 + 0.01 * night, max_points=points)
         out.append(folder / f"session{night}")
-        save_map(map_of_sequence(sequence.first(len(sequence.keyframes) - night)), out[-1], compress=False)
+        save_map(
+            map_of_sequence(sequence.first(min(keyframes, len(sequence.keyframes)) - night)), out[-1], compress=False
+        )
     return out
 
 
@@ -136,7 +143,7 @@ def _busy(process: psutil.Process) -> bool:
 
 def night(verdicts: Verdicts, options: argparse.Namespace, s3: Server, folder: Path) -> None:
     """All nights of all stores under faults, then the sentences."""
-    sessions = make_sessions(folder, options.nights, options.points)
+    sessions = make_sessions(folder, options.nights, options.points, options.keyframes)
     hand_s = by_hand(folder / "hand", sessions)
     hand = load_map(folder / "hand")
     root, names = Remote("s3", BUCKET, "chain"), [f"{k:03d}" for k in range(options.stores)]
@@ -144,13 +151,13 @@ def night(verdicts: Verdicts, options: argparse.Namespace, s3: Server, folder: P
     plan.write_text(f'[fleet]\nroot = "{root}"\n[job]\nmemory_gb = 0.0\nminutes = 30.0\nretries = 20\n')
     from ray.cluster_utils import Cluster
 
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    cluster: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     for _ in range(NODES - 1):
         cluster.add_node(num_cpus=1)
     s3.faults(FAILING)
     killer = Killer(options.kills, options.pause, options.seed)
     begin = time.perf_counter()
-    drivers, held_s = 0, 0.0
+    drivers, held_s, whole = 0, 0.0, b""
     try:
         for k, session in enumerate(sessions):
             last = k == len(sessions) - 1
@@ -182,6 +189,7 @@ def night(verdicts: Verdicts, options: argparse.Namespace, s3: Server, folder: P
             code, text = driver.wait()
             print(f"# night {k}: exit {code}, {text}", file=sys.stderr, flush=True)
         if len(names) > 2:
+            cut = root / names[2] / "walks" / "r1" / f"{night_of(len(sessions) - 1)}_2200" / "points.npz"
             objects.write(cut, whole)
             code, text = Driver(plan, cluster.address).wait()
             print(f"# after the second upload: exit {code}, {text}", file=sys.stderr, flush=True)
@@ -200,7 +208,7 @@ def night(verdicts: Verdicts, options: argparse.Namespace, s3: Server, folder: P
     )  # fmt: skip
     stores = {name: current(root / name / "map") for name in names}
     wanted = {session_id(load_map(session)) for session in sessions}
-    complete = sum(version.sessions.keys() == wanted for version in stores.values())
+    complete = sum(set(version.sessions) == wanted for version in stores.values())
     verdicts.row("nothing lost, nothing double", complete == len(names), f"{complete} of {len(names)} stores")
     equal = 0
     for name, version in stores.items():
@@ -295,7 +303,9 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=10, help="workers killed")
     parser.add_argument("--pause", type=float, default=5.0, help="mean seconds between two kills")
     parser.add_argument("--points", type=int, default=100, help="of a keyframe")
+    parser.add_argument("--keyframes", type=int, default=12, help="of a session, a tiny store's; 34: a whole aisle")
     parser.add_argument("--megabytes", type=int, default=300, help="of the recording for info; 0: none")
+    parser.add_argument("--write", action="store_true", help="replace the benchmark's figures")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     verdicts = Verdicts()
@@ -307,6 +317,8 @@ def main() -> None:
         if options.megabytes:
             one_file(verdicts, s3, options.megabytes)
         night(verdicts, options, s3, Path(place))
+    if options.write:
+        print(_figures.write("fleet", "Nights of a fleet with faults", verdicts.figures), file=sys.stderr)
     sys.exit(1 if verdicts.failed else 0)
 
 

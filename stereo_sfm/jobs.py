@@ -22,6 +22,8 @@ from stereo_sfm.errors import StereoSfmError, require
 
 # Ray's own switch for a single computer: all its ports are on the loopback address.
 LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+# A node whose agents take more than 15 s to start ends itself, and no setting of Ray changes these seconds.
+STARTS = 3  # tries on a busy computer
 GRACE = 1.2  # of its time, after which a job that does not react is ended with its worker
 
 Result = dict[str, Any]
@@ -87,12 +89,18 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
                     try:
                         result: Result = ray.get(reference)
                     except RayError as error:
-                        result = {"ok": False, "error": f"the task died: {error}".splitlines()[0]}
+                        result = {"ok": False, "error": f"the task died: {_why(error)}"}
                     results[job.name] = result
                     yield job, result
         finally:
             for reference in pending:
                 ray.cancel(reference, force=True)
+
+
+def _why(error: Exception) -> str:
+    """One line of an error of Ray: the last of a traceback, the first of a death."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return lines[-1 if hasattr(error, "traceback_str") else 0].strip() if lines else type(error).__name__
 
 
 def _check_memory(nodes: Sequence[Mapping[str, Any]], wanted: int) -> None:
@@ -114,13 +122,36 @@ def _ray(address: str | None) -> Generator[Any]:
 
     ours = not ray.is_initialized()
     if ours:
-        # Always "local": otherwise Ray waits for the last cluster that it knows, even if that is gone.
-        ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+        _start(ray, address)
     try:
         yield ray
     finally:
         if ours:
             ray.shutdown()
+
+
+def _start(ray: Any, address: str | None) -> None:
+    """Connect, or start a cluster of this computer alone.
+
+    Raises:
+        StereoSfmError: it does not start.
+    """
+    options: dict[str, Any] = {"include_dashboard": False, "log_to_driver": False, "logging_level": logging.ERROR}
+    if address is not None:
+        ray.init(address=address, **options)
+        return
+    for attempt in range(STARTS):
+        try:
+            # Not None: otherwise Ray waits for the last cluster that it knows, even if that is gone.
+            ray.init(address="local", **options)
+            return
+        except Exception as error:  # Ray raises nothing narrower
+            ray.shutdown()
+            if attempt == STARTS - 1:
+                raise StereoSfmError(
+                    f"Ray does not start on this computer ({str(error).splitlines()[0]}): "
+                    "try again when it is less busy, or name a cluster with --address"
+                ) from None
 
 
 def _within(work: Callable[..., Result], args: tuple[Any, ...], before: Mapping[str, Result], limits: Limits) -> Result:

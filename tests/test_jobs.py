@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import signal
 import time
@@ -48,8 +49,10 @@ def dies(counter: Path, times: int) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_jobs_on_ray(tmp_path: Path) -> None:
-    pytest.importorskip("ray")
+def test_jobs_on_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    if importlib.util.find_spec("ray") is None:  # imported by run_jobs, which sets it up before
+        pytest.skip("needs ray")
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)  # workers import this module
     jobs = [
         Job("dies", dies, (tmp_path / "dies", 2)),
         Job("always", dies, (tmp_path / "always", 99)),

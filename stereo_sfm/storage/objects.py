@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.util
+import json
 import os
 import re
 from collections.abc import Generator, Iterable
@@ -17,7 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.folder_lock import FolderLock
@@ -26,6 +27,7 @@ from stereo_sfm.storage.remote import Remote
 TRIES = 12  # of a request: a tenth of failing answers makes an object fail once in 10^12
 PATIENCE_S = 180.0  # for all tries of a request: a server that stands still for 20 s costs nothing
 CONNECT_S, REQUEST_S = 5.0, 60.0
+EMULATOR = "STORAGE_EMULATOR_HOST"  # of Google's own libraries: the address of another server than theirs
 FULL = re.compile(r"QuotaExceeded|StorageFull|InsufficientStorage|\b507\b|No space left|os error 28\b", re.I)
 DENIED = re.compile(r"AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|Forbidden|\b40[13]\b|os error 13\b", re.I)
 NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|The specified bucket does not exist", re.I)
@@ -70,7 +72,18 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
 
         with contextlib.suppress(ValueError):  # boto3 knows none: the computer's own role is asked for
             options["credential_provider"] = Boto3CredentialProvider()
-    plain = os.environ.get("AWS_ENDPOINT_URL", "").startswith("http://")
+    emulator = os.environ.get(EMULATOR, "") if scheme == "gs" else ""
+    if emulator:
+        options["service_account_key"] = json.dumps(
+            {
+                "gcs_base_url": emulator,
+                "disable_oauth": True,
+                "client_email": "",
+                "private_key": "",
+                "private_key_id": "",
+            }
+        )
+    plain = (emulator or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://")
     client = {"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=REQUEST_S)}
     options["client_options"] = {**client, **({"allow_http": True} if plain else {})}
     options["retry_config"] = {
@@ -135,7 +148,12 @@ def read_tagged(remote: Remote) -> tuple[bytes, str]:
 
     with _one_line(remote, "read"):
         found = obstore.get(store, remote.key)
-        return bytes(found.bytes()), str(found.meta["e_tag"])
+        return bytes(found.bytes()), str(found.meta[_condition(remote)])
+
+
+def _condition(remote: Remote) -> Literal["version", "e_tag"]:
+    """What a conditional put compares."""
+    return "version" if remote.scheme == "gs" else "e_tag"
 
 
 def size_and_tag(remote: Remote) -> tuple[int, str]:
@@ -223,7 +241,8 @@ def _conditional(remote: Remote, data: bytes, tag: str | None) -> None:
         import obstore
 
         with _one_line(remote, "write"):
-            obstore.put(store, remote.key, data, mode="create" if tag is None else {"e_tag": tag}, use_multipart=False)
+            mode: Any = "create" if tag is None else {_condition(remote): tag}
+            obstore.put(store, remote.key, data, mode=mode, use_multipart=False)
     except (Changed, Unreachable):
         with contextlib.suppress(Missing):
             if read(remote) == data:
