@@ -149,7 +149,7 @@ def _start(ray: Any, address: str | None) -> None:
             ray.shutdown()
             if attempt == STARTS - 1:
                 raise StereoSfmError(
-                    f"Ray does not start on this computer ({str(error).splitlines()[0]}): "
+                    f"Ray does not start on this computer ({_why(error)}): "
                     "try again when it is less busy, or name a cluster with --address"
                 ) from None
 
