@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,9 +14,10 @@ from stereo_sfm.fleet.versions import current, history, roll_back
 from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import fetch, send_folder
-from stereo_sfm.storage.objects import Changed, Missing
+from stereo_sfm.storage.objects import Missing
 from stereo_sfm.storage.remote import Remote
 from tests.fleet import azurite, gs_server
+from tests.fleet.writers import winners
 from tests.maps.maps import small_map
 
 
@@ -46,20 +46,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_one_of_many_writers_wins(cloud: Remote) -> None:
     target, tag = cloud / "head", None
     for turn in range(3):
-        won: list[int] = []
-
-        def write(k: int, tag: str | None = tag, won: list[int] = won, turn: int = turn) -> None:
-            try:
-                objects.exchange(target, f"{turn} {k}".encode(), tag)
-                won.append(k)
-            except Changed:
-                pass
-
-        threads = [threading.Thread(target=write, args=(k,)) for k in range(8)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        won = winners(target, turn, tag, 8)
         raw, tag = objects.read_tagged(target)
         assert len(won) == 1 and raw == f"{turn} {won[0]}".encode()
 

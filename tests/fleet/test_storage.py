@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 
 import pytest
@@ -11,10 +10,11 @@ from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_folder
-from stereo_sfm.storage.objects import Changed, Missing
+from stereo_sfm.storage.objects import Missing
 from stereo_sfm.storage.remote import Remote, place
 from stereo_sfm.storage.stream import PAGE, RangeStream
 from tests.fleet.s3_server import READER, Server
+from tests.fleet.writers import winners
 
 
 @pytest.mark.parametrize(
@@ -56,20 +56,7 @@ def test_one_of_many_writers_wins(place: str) -> None:
     """Ten exchange the same object at the same time, four times."""
     target, tag = Remote.of(place) / "head", None
     for turn in range(4):
-        won: list[int] = []
-
-        def write(k: int, tag: str | None = tag, won: list[int] = won, turn: int = turn) -> None:
-            try:
-                objects.exchange(target, f"{turn} {k}".encode(), tag)
-                won.append(k)
-            except Changed:
-                pass
-
-        threads = [threading.Thread(target=write, args=(k,)) for k in range(10)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
+        won = winners(target, turn, tag, 10)
         raw, tag = objects.read_tagged(target)
         assert len(won) == 1 and raw == f"{turn} {won[0]}".encode()
 

@@ -21,7 +21,7 @@ WINDOW_S = 1.0  # of motion whose mean is the velocity
 RETURN_S, SPREAD = np.array([4.0, 1.0]), np.array([0.8, 0.7])
 FIRST_SIGMAS = np.array([0.01, 0.005])  # metres, radians: of the last trusted pose and its velocity
 STEADY = np.array([0.05, 0.05])  # m/s, rad/s, standard deviations of a motion that goes on as before
-TURN_STEP = np.deg2rad(20.0)  # radians between turns that are tried: corners of two thirds of the view stay in it
+TURN_STEP = np.deg2rad(20.0)  # radians between turns that are tried
 SLOWER = 0.5, 0.0  # shares of the last speed that are tried
 TURNS = 2.0  # standard deviations of the turn up to which turns are tried
 
@@ -87,9 +87,8 @@ class MotionPrior:
         """The predicted pose at a time, with the last speed and turn rate decreasing exponentially."""
         (last_ns, last), periods = self._poses[-1], self._seconds(stamp_ns) / RETURN_S
         gone = -np.expm1(-periods)  # share of a speed that is gone
-        sigmas = SPREAD * RETURN_S * np.sqrt(np.maximum(2 * (periods - gone) - gone**2, 0.0))
-        if self._poses[0][0] == last_ns:  # and the speed is unknown
-            sigmas = SPREAD * RETURN_S * np.sqrt(2 * (periods - gone))
+        known = 0.0 if self._poses[0][0] == last_ns else gone**2  # by the velocity, once there is motion
+        sigmas = SPREAD * RETURN_S * np.sqrt(np.maximum(2 * (periods - gone) - known, 0.0))
         return Expectation.around(last @ se3.exp(self.velocity() * np.repeat(RETURN_S * gone, 3)), sigmas)
 
     def steady(self, stamp_ns: int) -> Expectation:
@@ -100,9 +99,8 @@ class MotionPrior:
     def others(self, stamp_ns: int) -> list[F64]:
         """Poses (4, 4) at a time after other motions that a robot is capable of, on arcs; the straight one first.
 
-        All of them begin at the last speed, which decreases exponentially.
-
-        The camera is taken to be upright: a robot turns about its y axis.
+        All of them begin at the last speed, which decreases exponentially. The camera is taken to be
+        upright: a robot turns about its y axis.
         """
         forward = self._forward() * RETURN_S[0] * -math.expm1(-self._seconds(stamp_ns) / RETURN_S[0])
         most = min(TURNS * self.expect(stamp_ns).sigma_rad, math.pi)

@@ -484,9 +484,8 @@ class Tracker:
         self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution
     ) -> None:
         """Keep an image to recover from, if it is better than the one before; asked of few images, which takes time."""
-        if image.stamp_ns - self._reference_ns >= REFERENCE_NS and not self._part.wanted(
-            self._follower.reference, image.stamp_ns
-        ):
+        due = image.stamp_ns - self._reference_ns >= REFERENCE_NS
+        if due and not self._part.wanted(self._follower.reference, image.stamp_ns):
             self._reference_ns = image.stamp_ns
             later = self._recovery.motion.steady(image.stamp_ns + UNSEEN_NS).odom_T_cam
             self._follower.refer_to(images, tracks, solution.inlier & ~tracks.moving, solution.pose, later)
