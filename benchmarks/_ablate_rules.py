@@ -83,8 +83,8 @@ RULES = (
     _rule(
         "alert for a second",
         SOLVER,
-        "STATIC_S if moving else max(self._alert_s - seconds, 0.0)",
-        "STATIC_S if moving else 0.0",
+        "ALERT_S if moving else max(self._alert_s - seconds, 0.0)",
+        "ALERT_S if moving else 0.0",
     ),
     _rule(
         "prior of long-static points",
