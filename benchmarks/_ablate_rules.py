@@ -222,7 +222,7 @@ RULES = (
     _rule(
         "a trusted pose",
         TRACKER,
-        "return agree >= max(MOST * int(np.count_nonzero(~tracks.moving)), enough)",
+        "return agree >= max(TRUSTED_SHARE * int(np.count_nonzero(~tracks.moving)), enough)",
         "return True",
     ),
     _rule("search in three rounds", TRACKER, "for reach, most in ROUNDS:", "for reach, most in ROUNDS[::2]:"),

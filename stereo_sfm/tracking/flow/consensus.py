@@ -20,15 +20,15 @@ from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, I32, I64, Bool, Corners
 
 MIN_GROUP = 8  # points of a group; fewer do not define a motion
-MOST = 0.75  # of the points that were tracked: a pose that so many agree with is that of the camera
+AGREEING_SHARE = 0.65  # of the points that were tracked; if fewer agree, another motion is searched for
 SURE_S = 0.3  # a point that was tracked for so long has its full weight ...
 MIN_WEIGHT = 0.1  # ... and a new one this
-LITTLE = 0.25  # of the inliers in an unobstructed view; with fewer the camera counts as covered
+MIN_OPEN_SHARE = 0.2  # of the inliers in an unobstructed view; with fewer the camera counts as covered
 WEIGHT_RATIO = 1.05  # by which another motion must outweigh the one that all points give
+ALERT_S = 1.0  # for which other motions are searched for after one was seen
 MOVING_NEIGHBOURS, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
-# For which a moving point must agree before it is used, and other motions are searched for after one was seen.
-STATIC_S, MIN_STATIC_FRAMES = 1.0, 4
+STATIC_S, MIN_STATIC_FRAMES = 1.0, 4  # for which a moving point must agree before it is used
 DISAGREES = 2  # frames of agreement that one of disagreement outweighs
 
 

@@ -14,10 +14,11 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.flow import pose_solver
 from stereo_sfm.tracking.flow.consensus import (
-    LITTLE,
+    AGREEING_SHARE,
+    ALERT_S,
     MIN_GROUP,
+    MIN_OPEN_SHARE,
     MIN_WEIGHT,
-    MOST,
     STATIC_S,
     SURE_S,
     WEIGHT_RATIO,
@@ -44,12 +45,16 @@ MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
 USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
 UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
+# A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
+# are static and of an unobstructed view, are believed whatever the motion.
+CONSISTENT_SHARE, CONSISTENT_OPEN = 0.8, 0.3
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
 # the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they move it
 # away: by 14 at most in 700 images of stores without people and of EuRoC. If by more than has 1 % of six degrees of
 # freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
 NEARER, SHIFT_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
 NO_PRIOR = np.full(6, np.inf)
+CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
 KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
@@ -119,7 +124,7 @@ class PoseSolution:
     @property
     def consistent(self) -> bool:
         """Whether most of the points that were found agree."""
-        return self.inliers >= MOST * len(self.error)
+        return self.inliers >= AGREEING_SHARE * len(self.error)
 
     def good(self, config: TrackerConfig, before: int) -> bool:
         """Whether enough of the `before` tracked points are inliers."""
@@ -192,7 +197,7 @@ class FramePoseSolver:
         if not suspected.any():
             return None
         by_known = self._optimise(tracks, expected.to(best.pose), known)
-        if by_known.inlier[known].sum() < MOST * known.sum():
+        if by_known.inlier[known].sum() < AGREEING_SHARE * known.sum():
             return None
         off = np.zeros(len(tracks), bool)
         off[suspected] = self.influence(tracks.keep(suspected), by_known)[1] > WRONG_SIGMAS
@@ -221,7 +226,7 @@ class FramePoseSolver:
         """The pose by all points, or the motion that is the camera's if objects move; none if too few show it."""
         static = ~tracks.moving
         rest = static & ~best.inlier
-        undisturbed = np.count_nonzero(in_group(tracks, rest)) < MIN_GROUP and best.inliers >= MOST * before
+        undisturbed = np.count_nonzero(in_group(tracks, rest)) < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
         if not best.reason:
             best = self._without_leverage_points(tracks, expected, static, best)
             rest = static & ~best.inlier
@@ -232,7 +237,7 @@ class FramePoseSolver:
         disturbed = self.alert or len(chosen.moving) > 0
         if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
             chosen = best
-        few = np.count_nonzero(chosen.inlier & static) < LITTLE * self.open_view
+        few = np.count_nonzero(chosen.inlier & static) < MIN_OPEN_SHARE * self.open_view
         if not few or (usual and not disturbed):
             return chosen
         if undisturbed and self._confirmed(best, static & tracks.mapped, 2 * self._config.min_features):
@@ -253,7 +258,7 @@ class FramePoseSolver:
     def _confirmed(self, solution: PoseSolution, known: Bool, least: int) -> bool:
         """Whether most of the points known before (N,), and at least so many, agree with a pose."""
         agree = (solution.inlier & known).sum()
-        return bool(agree >= max(least, MOST * known.sum()))
+        return bool(agree >= max(least, CONFIRMED_SHARE * known.sum()))
 
     def _choose(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
@@ -265,9 +270,9 @@ class FramePoseSolver:
         by_static, by_near = (solve(tracks, expected, static) for solve in (self._solve_static, self._solve_near))
         found = [agreed, by_static, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
-        if not plausible:  # a map update moves its points together, and the pose with them
+        if not plausible:
             agree = int((best.inlier & static & tracks.mapped).sum())
-            consistent = agree >= max(MOST * int(static.sum()), LITTLE * self.open_view)
+            consistent = agree >= max(CONSISTENT_SHARE * int(static.sum()), CONSISTENT_OPEN * self.open_view)
             return best if consistent or not self.alert else _no_pose(len(tracks), "no_consensus")
         weights = [self._support(tracks, s, expected) for s in plausible]
         k = int(np.argmax(weights))
@@ -362,7 +367,7 @@ class FramePoseSolver:
 
     def crowded(self, static_points: int) -> bool:
         """Whether objects that move hide so much of an open view that new points are needed in every image."""
-        return self.alert and static_points < MOST * self.open_view
+        return self.alert and static_points < AGREEING_SHARE * self.open_view
 
     @property
     def alert(self) -> bool:
@@ -393,7 +398,7 @@ class FramePoseSolver:
         moving = np.count_nonzero(tracks.moving) + np.count_nonzero(solution.moving) >= MIN_GROUP
         if self.alert and not moving:  # still there, with new points
             moving = in_group(tracks, ~tracks.moving & ~solution.inlier).sum() >= MIN_GROUP
-        self._alert_s = STATIC_S if moving else max(self._alert_s - seconds, 0.0)
+        self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)
         self._learn_noise(tracks, solution, seconds)
         if self.alert:
             return

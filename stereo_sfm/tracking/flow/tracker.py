@@ -23,7 +23,7 @@ from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.pixels import DARK
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.consensus import LITTLE, MOST, Movers, after_frame, static_frames
+from stereo_sfm.tracking.flow.consensus import Movers, after_frame, static_frames
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.keyframes import Keyframes
@@ -52,7 +52,10 @@ NOT_FOUND = (
     PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), 0.0, 0.0, "not_found"),
 )
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
-TRUSTED_LEFT = 0.5  # of the newest keyframe's points: a pose that most of so many agree with is beyond doubt
+TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
+TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
+TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
+SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on
 REFERENCE_NS = 200_000_000  # from one image that may become the reference to the next
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
@@ -61,7 +64,8 @@ REFERENCE_POINTS = 8  # times max_features, of the image to recover from: after 
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
 FOLLOWED_S = 0.5  # without a pose: with 2 m/s^2, a robot is a quarter of a metre from where it was expected
-RIGHT_LEVEL = 2  # of the pyramids, from which right pixels are looked for once many are missing
+FEW_RIGHT = 0.75  # of the share of points that had a right pixel before: they are looked for farther away ...
+RIGHT_LEVEL = 2  # ... from this level of the pyramids on
 
 
 class Tracker:
@@ -247,7 +251,7 @@ class Tracker:
         if self._sudden is None:
             return None
         found, before = (np.isfinite(t.uv_right[:, 0]).mean() if len(t) else 0.0 for t in (tracks, self._tracks))
-        if found < MOST * before:
+        if found < FEW_RIGHT * before:
             tracks = self._match_right(tracks, images, expected, RIGHT_LEVEL)
         if solution is None:
             by_left = replace(tracks, uv_right=np.full_like(tracks.uv_right, np.nan))
@@ -333,8 +337,8 @@ class Tracker:
         if solution.blurred:
             return False
         agree = int(np.count_nonzero(solution.inlier & ~tracks.moving))
-        enough = max(TRUSTED_LEFT * self._keyframes.points, LITTLE * self._solver.open_view)
-        return agree >= max(MOST * int(np.count_nonzero(~tracks.moving)), enough)
+        enough = max(TRUSTED_LEFT * self._keyframes.points, TRUSTED_OPEN * self._solver.open_view)
+        return agree >= max(TRUSTED_SHARE * int(np.count_nonzero(~tracks.moving)), enough)
 
     def _accept(
         self,
@@ -422,7 +426,7 @@ class Tracker:
         tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
         for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
-            if not any(within(pose, other, *SAME_PLACE) for other in tried):
+            if not any(within(pose, other, *SAME_START) for other in tried):
                 tried.append(pose)
                 tracks, solution = self._track_from(pose, images, seconds, refined)
                 if solution.reason:
