@@ -232,11 +232,11 @@ RULES = (
     _rule("rotation from anywhere", TRACKER, "for anywhere in (False, True):", "for anywhere in (False,):"),
     # Windows and stereo.
     _rule("tests give way", STEREO, "good = failed < self._gives_way(failed, needed)", "good = failed < 1.0"),
-    _rule("the match back", STEREO, "off[status != klt.TRACKED] = np.inf", "off[:] = 0.0"),
+    _rule("the match back", STEREO, "off[np.isnan(off)] = np.inf", "off[:] = 0.0"),
     _rule(
         "a narrower window",
         STEREO,
-        "np.maximum(np.linalg.norm(back - uv, axis=1), self._narrow_differs(left, right, uv, uv_right))",
+        "np.maximum(np.linalg.norm(back - uv, axis=1), np.linalg.norm(narrow - uv_right, axis=1))",
         "np.linalg.norm(back - uv, axis=1)",
     ),
     _rule(

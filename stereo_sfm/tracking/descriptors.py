@@ -12,10 +12,9 @@ import numpy as np
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F64, U8
 
-PATCH_SIZE = 31
-RADIUS = 15
+RADIUS = 15  # px, of the disc whose brightness tells the angle, as in OpenCV's ORB
 HALF_WIDTHS = np.sqrt(RADIUS**2 - np.arange(-RADIUS, RADIUS + 1) ** 2).astype(np.int32)  # of the disc's rows
-BORDER = 19  # of the image, where no descriptor is computed
+BORDER = 19  # px of the image without descriptors: what the turned pattern of pairs reaches
 
 
 @njit
@@ -49,8 +48,8 @@ def describe(image: U8, uv: F64) -> U8:
     if len(inside) == 0:
         return descriptors
     kept = np.ascontiguousarray(uv[inside])
-    orb = cv2.ORB.create(nlevels=1, edgeThreshold=BORDER, patchSize=PATCH_SIZE)
-    keypoints = cv2.KeyPoint.convert(kept.astype(np.float32), PATCH_SIZE)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    orb = cv2.ORB.create(nlevels=1, edgeThreshold=BORDER, patchSize=2 * RADIUS + 1)
+    keypoints = cv2.KeyPoint.convert(kept.astype(np.float32), 2 * RADIUS + 1)  # pyright: ignore[reportArgumentType, reportCallIssue]
     for keypoint, angle in zip(keypoints, (np.degrees(_intensity_angles(image, kept)) % 360.0).tolist(), strict=True):
         keypoint.angle = angle
     computed, rows = orb.compute(image, keypoints)

@@ -63,8 +63,7 @@ def test_a_poor_calibration_keeps_the_offset_of_each_match() -> None:
     """`triangulate` says how far a right pixel is from its curve: without that it lies where the point is seen."""
     rig = fisheye_rig()
     uv, right = matches(rig, 0, np.array([1.0, 2.0, -1.0]), 0.2)
-    cameras = StereoCameras.of(rig)
-    bearing, rho, _, offset = triangulate(uv, right, *cameras.cams, cameras.left_T_right, np.full(len(uv), 0.3))
+    bearing, rho, _, offset = triangulate(uv, right, StereoCameras.of(rig), np.full(len(uv), 0.3))
     seen = rig.project_right(bearing / rho[:, None])
     assert np.abs(seen + offset - right).max() < 1e-6
     assert np.linalg.norm(offset, axis=1).mean() > 0.5

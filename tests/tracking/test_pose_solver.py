@@ -136,9 +136,7 @@ def test_uncertain_distance_does_not_bias_the_pose() -> None:
 def test_triangulation_of_exact_pairs(camera: Camera) -> None:
     pose, points, uv, uv_right = scene(camera, 100, 7)
     cameras = StereoCameras.of(rig(camera))
-    bearing, rho, variance, epipolar = triangulate(
-        uv, uv_right, *cameras.cams, cameras.left_T_right, np.full(len(uv), 0.5)
-    )
+    bearing, rho, variance, epipolar = triangulate(uv, uv_right, cameras, np.full(len(uv), 0.5))
     truth = se3.transform(se3.inverse(pose), points)
     good = np.isfinite(rho)
     assert good.mean() > 0.95

@@ -56,16 +56,13 @@ def test_a_magnified_window_is_found_far_from_where_it_is_predicted() -> None:
     pyramid = klt.build_pyramid(texture, 4)
     seen = klt.build_pyramid(np.asarray(cv2.warpAffine(texture, matrix, (200, 200)), np.uint8), 4)
     uv = rng.uniform(70, 120, (12, 2))
-    patch, gradients = np.zeros((12, klt.FLAT_SIZE), np.float32), np.zeros((12, 2, klt.FLAT_SIZE), np.float32)
-    normal, contrast, bending = np.zeros((12, 6, 6)), np.zeros(12), np.zeros((12, 6, 6))
-    klt.make_patches(
-        pyramid, uv, np.arange(12), klt.WEIGHTS, klt.COORDINATES, patch, gradients, normal, contrast, bending
-    )
+    store = klt.Appearances.empty(12)
+    klt.make_patches(pyramid[0], uv, np.arange(12), store, klt.WEIGHTS, klt.COORDINATES)
     true = uv * scale + shift
     guess = true + rng.uniform(-20, 20, (12, 2))
     warps = np.tile(np.stack([np.eye(2), scale * np.eye(2), np.full((2, 2), np.nan)])[:, None], (1, 12, 1, 1))
     found, warp = np.full((12, 2), np.nan), np.zeros((12, 2, 2))
-    ncc = find_deformed(seen[1], guess, warps, np.arange(12), patch, 14, 1, found, warp)
+    ncc = find_deformed(seen[1], guess, warps, np.arange(12), store.patch, 14, 1, found, warp)
     near = np.linalg.norm(found - true, axis=1) < 2.0
     assert near.mean() > 0.8
     assert ncc[near].min() > 0.7

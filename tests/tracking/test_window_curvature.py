@@ -86,9 +86,8 @@ def picture(camera: Camera, camera_T_old: F64) -> U8:
 def test_a_window_on_the_floor_is_found_without_a_bias() -> None:
     camera, uv = CAMERAS[0], old_pixels()
     old, new = picture(camera, np.eye(4)), picture(camera, NEW_T_OLD)
-    store, slots = Patches(len(uv)), np.arange(len(uv))
-    arrays = store.patch, store.gradients, store.inverse_normal, store.contrast, store.bending
-    good = klt.make_patches(klt.build_pyramid(old, 1), uv, slots, klt.WEIGHTS, klt.COORDINATES, *arrays)
+    store, slots = Patches(len(uv)).windows, np.arange(len(uv))
+    good = klt.make_patches(klt.build_pyramid(old, 1)[0], uv, slots, store, klt.WEIGHTS, klt.COORDINATES)
     true, exact = mapped(camera, uv), warps(camera, uv)
     curved = curvatures(camera, uv, exact)
     spread = (klt.WEIGHTS * klt.COORDINATES[0] ** 2).sum()  # px^2, of a window's samples
@@ -97,7 +96,7 @@ def test_a_window_on_the_floor_is_found_without_a_bias() -> None:
     for curvature in (np.zeros_like(curved), curved):
         out, warp = true.copy(), exact.copy()
         ncc = klt.track_affine(
-            klt.build_pyramid(new, 1)[0], out, warp, curvature, slots, good, *arrays, 20, klt.WEIGHTS, klt.COORDINATES
+            klt.build_pyramid(new, 1)[0], out, warp, curvature, slots, good, store, 20, klt.WEIGHTS, klt.COORDINATES
         )
         error = out - true
         found = (ncc > 0.9) & (np.linalg.norm(error, axis=1) < 0.5)

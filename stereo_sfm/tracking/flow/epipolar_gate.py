@@ -15,7 +15,7 @@ from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, Bool
 
 PERCENTILE, ITS_SIGMAS = 25, 0.3186  # of the distances: right ones, whatever half of the matches are; of a normal one
-FIRST, MOST = 20.0, 200.0  # matches that the first guess counts for, and what was learned at most
+FIRST, LEARNED = 20.0, 200.0  # matches that the first guess counts for, and what was learned at most: some keyframes'
 
 
 class EpipolarGate:
@@ -69,7 +69,7 @@ class EpipolarGate:
         scatter = percentile(np.abs(signed - shape @ plane), PERCENTILE) / ITS_SIGMAS
         before = max(self._matches, FIRST)
         self._variance = (before * self._variance + len(signed) * scatter**2) / (before + len(signed))
-        self._matches = min(self._matches + len(signed), MOST)
+        self._matches = min(self._matches + len(signed), LEARNED)
 
 
 # (3, 3) information about the plane by a match, if matches are spread evenly over the image.

@@ -141,7 +141,15 @@ class Follower:
         radius = max(round(0.5 * reach * self._camera.width), 1)
         step = math.ceil(radius / SEARCH_STEPS)
         ncc = find_deformed(
-            pyramid[1], guess[rows], warps @ tracks.warp, tracks.slot, self._patches.patch, radius, step, uv, warp
+            pyramid[1],
+            guess[rows],
+            warps @ tracks.warp,
+            tracks.slot,
+            self._patches.windows.patch,
+            radius,
+            step,
+            uv,
+            warp,
         )
         self.search_widely()
         curvature = self._curvatures(tracks, self.reference.pose, pose)
@@ -228,11 +236,11 @@ class Follower:
     def _translate(self, uv: F64, pyramid: klt.Pyramid, guess: F64) -> tuple[F64, Bool]:
         """Pixels (N, 2) of points (N, 2) px of the last image, and which of them are found."""
         assert self._last is not None
-        config, found = self._config, guess.copy()
-        status, _ = klt.track_translation(
-            self._last, pyramid, uv, found, self._first_level, 0, 10, config.min_contrast, config.min_ncc, klt.WEIGHTS
+        config = self._config
+        moved = klt.track_translation(
+            self._last, pyramid, uv, guess, self._first_level, 0, config.min_contrast, config.min_ncc, klt.WEIGHTS
         )
-        return found, status == klt.TRACKED
+        return moved, np.isfinite(moved[:, 0])
 
     def _curvatures(self, tracks: Tracks, last_pose: F64, pose: F64) -> F64:
         """(N, 6) the quadratic parts of the deformations in an image at a pose (4, 4); warps are of the last."""
@@ -248,11 +256,10 @@ class Follower:
         self, pyramid: klt.Pyramid, uv: F64, warp: F64, curvature: F64, slots: I64, wanted: Bool
     ) -> tuple[F64, F64, Bool]:
         """Align first appearances with an image: pixels (N, 2), deformations (N, 2, 2), which are found (N,)."""
-        uv, warp, store = uv.copy(), warp.copy(), self._patches
+        uv, warp = uv.copy(), warp.copy()
         ncc = klt.track_affine(
-            pyramid[0], uv, warp, curvature, slots, wanted, store.patch, store.gradients, store.inverse_normal,
-            store.contrast, store.bending, 6, klt.WEIGHTS, klt.COORDINATES,
-        )  # fmt: skip
+            pyramid[0], uv, warp, curvature, slots, wanted, self._patches.windows, 6, klt.WEIGHTS, klt.COORDINATES
+        )
         return uv, warp, np.asarray(ncc > self._config.min_anchor_ncc)
 
     def turned(
@@ -290,10 +297,7 @@ class Follower:
         """
         store = self._patches
         slots = store.take(len(uv))
-        textured = klt.make_patches(
-            pyramid, uv[: len(slots)], slots, klt.WEIGHTS, klt.COORDINATES, store.patch, store.gradients,
-            store.inverse_normal, store.contrast, store.bending,
-        )  # fmt: skip
+        textured = klt.make_patches(pyramid[0], uv[: len(slots)], slots, store.windows, klt.WEIGHTS, klt.COORDINATES)
         store.rays[slots] = window_rays(self._camera, uv[: len(slots)], pose[:3, :3])
         store.origin[slots] = pose[:3, 3]
         return np.flatnonzero(textured), slots[textured]

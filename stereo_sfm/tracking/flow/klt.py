@@ -12,6 +12,7 @@ against its first appearance removes the drift, and its dissimilarity detects wi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,12 +21,28 @@ from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
 from stereo_sfm.tracking.flow.warped_windows import HALF, sample_affine
 from stereo_sfm.tracking.flow.windows import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, dot, sample, sample_wide
-from stereo_sfm.types import U8
+from stereo_sfm.types import F32, F64, U8
 
-FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
-TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # result for a point
+FINE, COARSE = 0.01, 0.1  # px, last step of an alignment: in the image itself, and where a finer one follows
+ITERATIONS = 10  # on each level, at most: most need four
 
 Pyramid = tuple[U8, ...]
+
+
+class Appearances(NamedTuple):
+    """First appearances of M points, for `track_affine`."""
+
+    patch: F32  # (M, FLAT_SIZE) grey levels without their mean
+    gradients: F32  # (M, 2, FLAT_SIZE) times the weights
+    inverse_normal: F64  # (M, 6, 6)
+    contrast: F64  # (M,)
+    bending: F64  # (M, 6, 6) what the quadratic part of a deformation adds to the right-hand side, by its coefficients
+
+    @staticmethod
+    def empty(count: int) -> Appearances:
+        """Of so many points."""
+        patch, gradients = np.zeros((count, FLAT_SIZE), np.float32), np.zeros((count, 2, FLAT_SIZE), np.float32)
+        return Appearances(patch, gradients, np.zeros((count, 6, 6)), np.zeros(count), np.zeros((count, 6, 6)))
 
 
 def build_pyramid(image: U8, levels: int) -> Pyramid:
@@ -71,8 +88,8 @@ def _inside(image, u, v, margin):
 def _template(image, u, v, weights, raw, wide, patch, gx, gy):
     """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
 
-    Returns mean, contrast, the 2x2 normal matrix (hxx, hxy, hyy), and the mean gradients. `gx`, `gy` are left
-    multiplied by the weights: their dot product with a window is the right-hand side, whatever the window's mean.
+    Returns contrast, the 2x2 normal matrix (hxx, hxy, hyy), and the mean gradients. `gx`, `gy` are left multiplied
+    by the weights: their dot product with a window is the right-hand side, whatever the window's mean.
     """
     half = np.float32(0.5)
     sample_wide(image, u - HALF, v - HALF, wide)
@@ -96,7 +113,7 @@ def _template(image, u, v, weights, raw, wide, patch, gx, gy):
         gy[m] = raw[m]
         raw[m] = patch[m] * weights[m]
     contrast = math.sqrt(max(dot(raw, patch), 1e-6))
-    return mean, contrast, hxx, hxy, hyy, mx, my
+    return contrast, hxx, hxy, hyy, mx, my
 
 
 @njit
@@ -111,54 +128,47 @@ def _compare(window, patch, weights, raw):
 
 
 @njit
-def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, iterations, min_contrast, min_ncc, weights):
+def track_translation(prev, cur, uv, guess, first_level, last_level, min_contrast, min_ncc, weights):
     """Follow points from one pyramid into another.
 
     Args:
-        prev, cur: pyramids (tuples of uint8 images). uv_prev: (N, 2) float64 px in prev[0]. uv_cur: (N, 2) float64 px,
-            the predicted positions; overwritten with the result.
+        prev, cur: pyramids (tuples of uint8 images). uv, guess: (N, 2) px in prev[0], and predicted in cur[0].
         first_level, last_level: coarsest level to start at, finest level to end at (0 is the image itself).
-        iterations: at most, per level. min_contrast: grey levels of standard deviation below which a window is flat.
+        min_contrast: grey levels of standard deviation below which a window is flat.
         min_ncc: least normalised correlation of the windows at the end. weights: WEIGHTS.
 
     Returns:
-        status (N,) int8 (TRACKED, ...), ncc (N,) float32.
+        (N, 2) px in cur[0]; NaN outside of an image, where a window is flat or unlike, or where the search diverges.
     """
-    n = uv_prev.shape[0]
-    status = np.zeros(n, np.int8)
-    ncc = np.zeros(n, np.float32)
+    out = np.full(uv.shape, np.nan)
     raw = np.zeros(FLAT_SIZE, np.float32)
     patch = np.zeros(FLAT_SIZE, np.float32)
     gx = np.zeros(FLAT_SIZE, np.float32)
     gy = np.zeros(FLAT_SIZE, np.float32)
     wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
     window = np.zeros(FLAT_SIZE, np.float32)
-    for k in range(n):
-        u, v = uv_cur[k, 0], uv_cur[k, 1]
-        state = OUTSIDE
-        if not (math.isfinite(u) and math.isfinite(v)):
-            status[k] = OUTSIDE
-            continue
+    for k in range(uv.shape[0]):
+        u, v = guess[k, 0], guess[k, 1]
+        found = False
         for level in range(first_level, last_level - 1, -1):
+            found = False
             scale = 1.0 / (1 << level)
             image, target = prev[level], cur[level]
-            pu, pv = uv_prev[k, 0] * scale, uv_prev[k, 1] * scale
+            pu, pv = uv[k, 0] * scale, uv[k, 1] * scale
             cu, cv = u * scale, v * scale
-            if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):
-                state = OUTSIDE
+            if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):  # also NaN
                 continue
-            _, contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, patch, gx, gy)
+            contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, patch, gx, gy)
             det = hxx * hyy - hxy * hxy
             if contrast < min_contrast or det < 1e-3 * (hxx + hyy) * (hxx + hyy):
-                state = FLAT
                 continue
-            state = TRACKED
+            found = True
             start_u, start_v = cu, cv
             tx, ty = dot(gx, patch), dot(gy, patch)
             gain = 1.0
-            for iteration in range(iterations):
+            for iteration in range(ITERATIONS):
                 if not _inside(target, cu, cv, HALF + 0.5):
-                    state = OUTSIDE
+                    found = False
                     break
                 sample(target, cu - HALF, cv - HALF, window)
                 if iteration == 0 or iteration == 2:
@@ -175,38 +185,33 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                 cv -= dv
                 if length < (FINE if level == 0 else COARSE):
                     break
-            if (cu - start_u) ** 2 + (cv - start_v) ** 2 > 100.0:
-                state = DIVERGED
-            if state == TRACKED and level == last_level:
-                if _inside(target, cu, cv, HALF + 0.5):
+            found = found and (cu - start_u) ** 2 + (cv - start_v) ** 2 <= 100.0
+            if found and level == last_level:
+                found = _inside(target, cu, cv, HALF + 0.5)
+                if found:
                     sample(target, cu - HALF, cv - HALF, window)
                     _, contrast_c, cross = _compare(window, patch, weights, raw)
-                    ncc[k] = cross / (contrast * contrast_c)
-                    if ncc[k] < min_ncc:
-                        state = UNLIKE
-                else:
-                    state = OUTSIDE
-            if state != TRACKED:
+                    found = np.float32(cross / (contrast * contrast_c)) >= min_ncc
+            if not found:
                 break
             u, v = cu / scale, cv / scale
-        status[k] = state
-        uv_cur[k, 0], uv_cur[k, 1] = u, v
-    return status, ncc
+        if found:
+            out[k, 0], out[k, 1] = u, v
+    return out
 
 
 @njit
-def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inverse_normal, contrast, bending):
+def make_patches(image, uv, slots, store, weights, coordinates):
     """Store the appearance of points for `track_affine`.
 
     Args:
-        pyramid: of the image in which the points are first observed. uv: (N, 2) px. coordinates: COORDINATES.
-        slots: (N,) rows of the store that follows: patch (M, FLAT_SIZE), gradients (M, 2, FLAT_SIZE), inverse_normal
-            (M, 6, 6), contrast (M,), bending (M, 6, 6); these rows are filled in. `bending` is what the quadratic part
-            of a deformation contributes to the right-hand side, by its six coefficients.
+        image: (H, W) uint8, in which the points are first observed. uv: (N, 2) px.
+        slots: (N,) rows of `store`, `Appearances`, which are filled in. weights, coordinates: WEIGHTS, COORDINATES.
 
     Returns:
         (N,) bool, False where the window leaves the image or has no texture.
     """
+    patch, gradients, inverse_normal, contrast, bending = store
     n = uv.shape[0]
     good = np.zeros(n, np.bool_)
     raw = np.zeros(FLAT_SIZE, np.float32)
@@ -215,12 +220,12 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     unweighted = np.zeros(FLAT_SIZE, np.float32)
     normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
     for row in range(n):
-        if not _inside(pyramid[0], uv[row, 0], uv[row, 1], HALF + 1.5):
+        if not _inside(image, uv[row, 0], uv[row, 1], HALF + 1.5):
             continue
         k = slots[row]
         gx, gy = gradients[k, 0], gradients[k, 1]
-        result = _template(pyramid[0], uv[row, 0], uv[row, 1], weights, raw, wide, patch[k], gx, gy)
-        contrast[k] = result[1]
+        result = _template(image, uv[row, 0], uv[row, 1], weights, raw, wide, patch[k], gx, gy)
+        contrast[k] = result[0]
         if contrast[k] < 1.0:
             continue
         # gx, gy are already weighted; a second factor for the normal matrix needs them unweighted.
@@ -247,7 +252,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
             continue
         good[row] = invert_symmetric(normal, inverse_normal[k], factor)
         for a in range(2):
-            mean_gradient = np.float32(result[5] if a == 0 else result[6])
+            mean_gradient = np.float32(result[4] if a == 0 else result[5])
             for m in range(FLAT_SIZE):
                 unweighted[m] = gradients[k, a, m] * raw[m] + mean_gradient
             for c in range(3):
@@ -264,33 +269,18 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
 
 
 @njit
-def track_affine(
-    image,
-    uv,
-    warp,
-    curvature,
-    slots,
-    wanted,
-    patch,
-    gradients,
-    inverse_normal,
-    contrast,
-    bending,
-    iterations,
-    weights,
-    coordinates,
-):
+def track_affine(image, uv, warp, curvature, slots, wanted, store, iterations, weights, coordinates):
     """Align the first appearance of points with an image.
 
     Args:
         image: (H, W) uint8. uv: (N, 2) px and warp: (N, 2, 2), the positions and affine deformations to start from;
             overwritten. curvature: (N, 6) the deformations' quadratic parts, see `window_curvatures`. slots: (N,) rows
-            of the points in the store (patch, gradients, inverse_normal, contrast, bending) that `make_patches` filled.
-            wanted: (N,) bool, others are skipped.
+            of the points in the `store` that `make_patches` filled. wanted: (N,) bool, others are skipped.
 
     Returns:
         ncc (N,) float32 normalised correlation after alignment, 0 where the window left the image or did not converge.
     """
+    patch, gradients, inverse_normal, contrast, bending = store
     n = uv.shape[0]
     ncc = np.zeros(n, np.float32)
     window = np.zeros(FLAT_SIZE, np.float32)  # zero beyond the samples, always

@@ -10,6 +10,7 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.tracking.flow.consensus import MOVING_NEIGHBOURS, Movers
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
+from stereo_sfm.tracking.flow.pose_solver import MIN_RHO
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
@@ -17,7 +18,6 @@ from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64
 
-MIN_RHO = 1e-4  # 1/m
 FEW = 0.25  # share of the points wanted, below which the tests of their windows give way
 SPACING = 0.75  # of the side of the square per point if points were evenly spread
 

@@ -31,9 +31,9 @@ from stereo_sfm.types import F64, I64, Frame, Keyframe, StereoImage
 MIN_PAIRS = 20  # of images
 MIN_POINTS = 30  # in both images of a pair
 DEVIATIONS = 4.0  # standard errors between measured and calibrated readout that make a difference significant
-DIFFERENT_S = 0.005  # smallest difference
 SMOOTHING = 0.1  # share of the readout: velocities from poses 1/15 s apart, of a robot with vibration
-KNOWN_S = 0.005  # largest standard error with which a readout of 20 ms, a common one, differs from none
+# Smallest difference, and largest standard error with which a readout of 20 ms, a common one, differs from none.
+KNOWN_S = 0.005
 CAUCHY = 2.0  # standard deviations
 ROUNDS = 4  # of reweighting
 
@@ -50,7 +50,7 @@ class Readout:
     @property
     def differs(self) -> bool:
         """Whether the measurement differs significantly from the calibration."""
-        return abs(self.measured_s - self.calibrated_s) > max(DEVIATIONS * self.sigma_s, DIFFERENT_S)
+        return abs(self.measured_s - self.calibrated_s) > max(DEVIATIONS * self.sigma_s, KNOWN_S)
 
     @property
     def known(self) -> bool:

@@ -27,7 +27,6 @@ MAX_STRETCH = 3.0  # of a window, in any direction
 COARSE = SIZE // 2  # samples of a window in the half image, along each side
 SAMPLES = COARSE * COARSE
 MIN_VARIANCE = 1e-3  # of a window, grey levels squared
-LARGEST = 40  # px of the half image, of a window with MAX_STRETCH along both sides
 
 
 def surfaces_around(camera: Camera, uv: F64, points: F64) -> F64:
@@ -121,7 +120,7 @@ def _find_deformed(phases, height, width, uv, warps, slots, patch, radius, step,
     small = np.zeros(SAMPLES, np.float32)
     corner, weight = np.zeros((SAMPLES, 2), np.int64), np.zeros((4, SAMPLES), np.float32)
     start = np.zeros((4, SAMPLES), np.int64)
-    side = (2 * radius + LARGEST) // step + 3
+    side = int(2 * radius + 2 * MAX_STRETCH * (COARSE - 1)) // step + 3  # of a window stretched along both sides
     area = np.zeros(step * step * side * side, np.float32)
     sums, squares = np.zeros(side * side, np.float32), np.zeros(side * side, np.float32)
     cross = np.zeros(side * side, np.float32)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereo_sfm.tracking.flow.pose_solver import MIN_RHO
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64
-
-MIN_RHO = 1e-4  # 1/m
 
 
 def triangulate_tracks(

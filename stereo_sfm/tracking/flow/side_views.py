@@ -22,21 +22,17 @@ from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.dominant_direction import dominant_direction
 from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.tracking.descriptors import RADIUS
 from stereo_sfm.tracking.flow.klt import Pyramid
-from stereo_sfm.tracking.flow.place_corners import BORDER, FAST_THRESHOLD, LEVELS, SCALE, seen_by_both
-from stereo_sfm.tracking.flow.stereo import StereoMatcher
+from stereo_sfm.tracking.flow.place_corners import StereoOrb
 from stereo_sfm.types import F32, F64, U8, Corners
 
 FOCAL = 0.7  # focal length of a view over the camera's: about the resolution of the image
 HALF_ANGLES = 2.14, 1.0  # tangents of half the field of view, horizontal and vertical: 65 and 45 degrees
 MAX_FOCAL_PX = 320.0  # finer views take longer and find no more
 NODE_SPACING = 16  # px of a view between exactly projected pixels; the map is interpolated between them
-OUTSIDE = np.float32(-1e3)  # px: no pixel of the image
-MIN_NODES = 3  # of these in both directions; with fewer there is no view
-HEIGHT_BAND, MAX_SIGMA = (
-    1.1,
-    0.3,
-)  # metres: height over the camera and uncertainty of points that determine the shelves' direction
+# Metres: height over the camera and uncertainty of points that determine the shelves' direction.
+HEIGHT_BAND, MAX_SIGMA = 1.1, 0.3
 CELL, MIN_SIGMA = 0.08, 0.05  # metres, of the histogram and of a point's uncertainty
 SPACING = 0.3, 0.35  # between successive views: share of the distance to the shelves, radians
 MIN_SPACING_M = 0.25  # between successive views
@@ -53,16 +49,14 @@ class _View:
 
 
 class SideViews:
-    """Oriented FAST with rotated BRIEF (Rublee et al., ORB, ICCV 2011) in the two views."""
+    """Corners of the two views."""
 
     def __init__(self, config: Config, rig: Rig) -> None:
-        self._rig, self._stereo = rig, StereoMatcher(config.tracker, rig)
+        self._rig, self._orb = rig, StereoOrb(config.tracker, rig, config.loop.side_corners // 2)
         self._disparity_sigma = config.loop.disparity_sigma_px
         self._min_z = np.cos(np.deg2rad(config.tracker.max_angle_deg))
         self._focal = min(FOCAL * rig.left.fx, MAX_FOCAL_PX)
         self._left_mask = None if rig.left_mask is None else rig.left_mask.astype(np.uint8)
-        half = config.loop.side_corners // 2
-        self._orb = cv2.ORB.create(half, SCALE, LEVELS, edgeThreshold=BORDER, fastThreshold=FAST_THRESHOLD)
         self._last: tuple[int, F64, float] | None = None  # newest: submap, odom_T_cam, distance to the shelves
 
     @staticmethod
@@ -74,7 +68,7 @@ class SideViews:
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
         self._rig = rig
-        self._stereo.use(rig)
+        self._orb.use(rig)
 
     def find(self, left: Pyramid, right: Pyramid | F32, corners: Corners, odom_T_cam: F64, submap_id: int) -> Corners:
         """The corners of both views that both cameras see; none if the camera has hardly moved since the last ones.
@@ -122,24 +116,24 @@ class SideViews:
         uv = self._rig.left.project(rays)
         seen = self._rig.left.inside(uv, 1.0) & (rays[..., 2] > self._min_z * np.linalg.norm(rays, axis=-1))
         rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
-        if len(rows) < MIN_NODES or len(columns) < MIN_NODES:
+        if (min(len(rows), len(columns)) - 1) * NODE_SPACING <= 2 * RADIUS:  # no corner so far from the border
             return None
         cut = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         nodes = np.where(seen[..., None], uv, np.nan)[cut].astype(np.float32)
         *maps, mask = _interpolated(nodes)
         if self._left_mask is not None:
             mask &= np.asarray(cv2.remap(self._left_mask, maps[0], maps[1], cv2.INTER_NEAREST), np.uint8)
-        mask = np.asarray(cv2.erode(mask, np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)), np.uint8)
+        mask = np.asarray(cv2.erode(mask, np.ones((2 * RADIUS + 1, 2 * RADIUS + 1), np.uint8)), np.uint8)
         return _View(camera_R_view, np.array([x[columns[0]], y[rows[0]]]), (maps[0], maps[1]), mask)
 
     def _corners(self, left: Pyramid, right: Pyramid | F32, view: _View) -> Corners:
-        image = cv2.remap(left[0], view.maps[0], view.maps[1], cv2.INTER_LINEAR)
-        keypoints, descriptors = self._orb.detectAndCompute(image, view.mask)
-        if not len(keypoints):
-            return Corners.none()
-        xy = (np.asarray(cv2.KeyPoint.convert(keypoints), np.float64) + view.first) / self._focal
-        uv = self._rig.left.project(np.column_stack([xy, np.ones(len(xy))]) @ view.camera_R_view.T)
-        return seen_by_both(self._stereo, left, right, uv, np.asarray(descriptors, np.uint8))
+        image = np.asarray(cv2.remap(left[0], view.maps[0], view.maps[1], cv2.INTER_LINEAR), np.uint8)
+
+        def pixels(xy: F64) -> F64:
+            slopes = (xy + view.first) / self._focal
+            return self._rig.left.project(np.column_stack([slopes, np.ones(len(xy))]) @ view.camera_R_view.T)
+
+        return self._orb.find(image, view.mask, pixels, left, right)
 
 
 @njit
@@ -151,7 +145,7 @@ def _interpolated(nodes):
     """
     step = NODE_SPACING
     h, w = (nodes.shape[0] - 1) * step, (nodes.shape[1] - 1) * step
-    columns, rows = np.full((h, w), OUTSIDE, np.float32), np.full((h, w), OUTSIDE, np.float32)
+    columns, rows = np.full((h, w), -1, np.float32), np.full((h, w), -1, np.float32)  # no pixel of the image
     seen = np.zeros((h, w), np.uint8)
     for i in range(nodes.shape[0] - 1):
         for j in range(nodes.shape[1] - 1):

@@ -13,9 +13,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median, percentile
 from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.epipolar_gate import EpipolarGate
+from stereo_sfm.tracking.flow.epipolar_gate import LEARNED, PERCENTILE, EpipolarGate
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
-from stereo_sfm.tracking.flow.stereo_match import patch_sums, search_epipolar, triangulate
+from stereo_sfm.tracking.flow.stereo_match import search_epipolar, triangulate
 from stereo_sfm.tracking.flow.surface import INTERPOLATION, fit_planes
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F32, F64, Bool, StereoImage
@@ -23,10 +23,8 @@ from stereo_sfm.types import F32, F64, Bool, StereoImage
 SEARCH_LEVEL = 1
 BEHIND_SIGMAS = 4.0  # by which noise may put a far point behind the camera
 MIN_SIGMA_PX = 0.07  # of a disparity: least noise
-TYPICAL = 25  # percentile of the points' misfits that is typical of windows on one surface
 MIN_MISFIT = 0.5  # lower bound of the typical misfit, in squares of the expected noise
 MOST_FAILED = 3.0  # times the limits of the windows' tests, where matches are few
-LEARNED = 200.0  # matches that the typical noise counts for at most: those of some keyframes
 
 
 @dataclass
@@ -95,13 +93,13 @@ class StereoMatcher:
                 which on they are looked for.
         """
         if not isinstance(right, tuple):
-            return self._from_depth(right, uv)[0]
+            return points_from_depth(self._rig, right, uv)[1]
         points_cam = se3.transform(se3.inverse(predicted), points)
         guess_left = self._rig.left.project(points_cam)
         assert self._rig.right is not None
         guess = self._rig.right.project(se3.transform(self._cameras.right_T_left, points_cam))
         guess += uv - guess_left + offset
-        fitted, _, failed = self._on_one_surface(left, right, uv, self._refine(left, right, uv, guess, level))
+        fitted, _, failed = self._on_one_surface(left, right, uv, self._moved(left, right, uv, guess, level))
         fitted[failed >= 1.0] = np.nan
         return fitted
 
@@ -112,24 +110,20 @@ class StereoMatcher:
         typical of the sequence. Where fewer than `needed` matches pass, they give way: the next best follow, with
         standard deviations that are larger by as much as they fail. The epipolar curves do not.
         """
-        config = self._config
         uv = np.ascontiguousarray(uv)
         if isinstance(right, tuple):
             self._right_area.learn(right[1])
-            uv_right = self._refine(left, right, uv, self._search(left, right, uv), 1)
-            back = uv.copy()
-            status, _ = klt.track_translation(
-                right, left, np.nan_to_num(uv_right, nan=-1e3), back, 0, 0, 10, config.min_contrast, config.min_ncc,
-                klt.WEIGHTS,
-            )  # fmt: skip
-            off = np.maximum(np.linalg.norm(back - uv, axis=1), self._narrow_differs(left, right, uv, uv_right))
-            off[status != klt.TRACKED] = np.inf
+            uv_right = self._moved(left, right, uv, self._search(left, right, uv), SEARCH_LEVEL)
+            back = self._moved(right, left, uv_right, uv)
+            narrow = klt.track_translation(left, right, uv, uv_right, 0, 0, 0.5, 0.3, self._narrow)
+            off = np.maximum(np.linalg.norm(back - uv, axis=1), np.linalg.norm(narrow - uv_right, axis=1))
+            off[np.isnan(off)] = np.inf
             uv_right, sigma_px, failed = self._on_one_surface(left, right, uv, uv_right, off)
             good = failed < self._gives_way(failed, needed)
             sigma_px = sigma_px * np.clip(failed, 1.0, None)
         else:
-            uv_right, good = self._from_depth(right, uv)
-            sigma_px = self._usual_sigma(uv)
+            uv_right, sigma_px = points_from_depth(self._rig, right, uv)[1], self._usual_sigma(uv)
+            good = np.isfinite(uv_right[:, 0])
         return self._triangulated(uv, uv_right, sigma_px, good, -BEHIND_SIGMAS)
 
     @staticmethod
@@ -144,19 +138,15 @@ class StereoMatcher:
         uv = np.ascontiguousarray(uv)
         if not isinstance(right, tuple):
             return self.match(left, right, uv)
-        uv_right = self._search(left, right, uv)
-        status, _ = klt.track_translation(
-            left, right, uv, uv_right, SEARCH_LEVEL, SEARCH_LEVEL, 10, self._config.min_contrast, self._config.min_ncc,
-            klt.WEIGHTS,
-        )  # fmt: skip
-        sigma_px, good = self._usual_sigma(uv), status == klt.TRACKED
-        return self._triangulated(uv, uv_right, sigma_px, good, 0.0, learns=False)
+        uv_right = self._moved(left, right, uv, self._search(left, right, uv), SEARCH_LEVEL, SEARCH_LEVEL)
+        good = np.isfinite(uv_right[:, 0])
+        return self._triangulated(uv, uv_right, self._usual_sigma(uv), good, 0.0, learns=False)
 
     def _search(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64) -> F64:
         """Right pixels (N, 2), accurate to a pixel of the search level, NaN without a match."""
         return search_epipolar(
-            left[SEARCH_LEVEL], right[SEARCH_LEVEL], patch_sums(right[SEARCH_LEVEL]), uv, 2.0**SEARCH_LEVEL,
-            *self._cameras.cams, self._cameras.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
+            left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, self._cameras, self._min_depth,
+            self._candidates, 25.0, 1.2,
         )  # fmt: skip
 
     def _usual_sigma(self, uv: F64) -> F64:
@@ -176,29 +166,21 @@ class StereoMatcher:
         """`min_rho_sigmas`: smallest inverse distance in its standard deviations; noise may make it negative. `gated`:
         whether the matches must be near their epipolar curves, about which the gate `learns` from them.
         """
-        bearing, rho, variance, offset = triangulate(
-            uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, sigma_px
-        )
+        bearing, rho, variance, offset = triangulate(uv, uv_right, self._cameras, sigma_px)
         with np.errstate(invalid="ignore"):
             good = good & (rho > min_rho_sigmas * np.sqrt(variance)) & (rho < 1.0 / (0.5 * self._min_depth))
         if gated:
             good = self._gate.passed(self._rig, uv, uv_right, good, learns)
         return StereoMatch(uv, uv_right, bearing, rho, variance, offset, good)
 
-    def _refine(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, guess: F64, level: int) -> F64:
-        out = np.ascontiguousarray(guess)
-        status, _ = klt.track_translation(
-            left, right, np.ascontiguousarray(uv), out, level, 0, 10, self._config.min_contrast, self._config.min_ncc,
-            klt.WEIGHTS,
+    def _moved(
+        self, before: klt.Pyramid, after: klt.Pyramid, uv: F64, guess: F64, first_level: int = 0, last_level: int = 0
+    ) -> F64:
+        """Where points (N, 2) px of one image are in another, NaN where not found."""
+        return klt.track_translation(
+            before, after, np.ascontiguousarray(uv), np.ascontiguousarray(guess), first_level, last_level,
+            self._config.min_contrast, self._config.min_ncc, klt.WEIGHTS,
         )  # fmt: skip
-        out[status != klt.TRACKED] = np.nan
-        return out
-
-    def _narrow_differs(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> F64:
-        """(N,) px by which a narrower window gives another disparity; inf where it gives none."""
-        narrow = np.nan_to_num(uv_right, nan=-1e3)
-        status, _ = klt.track_translation(left, right, uv, narrow, 0, 0, 10, 0.5, 0.3, self._narrow)
-        return np.where(status == klt.TRACKED, np.linalg.norm(narrow - uv_right, axis=1), np.inf)
 
     def _on_one_surface(
         self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64, off: F64 | None = None
@@ -211,13 +193,12 @@ class StereoMatcher:
         `off`: (N,) px, more differences; of new matches, from which is learned.
         """
         fitted, misfit, sigma_px = fit_planes(
-            left[0], right[0], np.ascontiguousarray(uv), uv_right, *self._cameras.cams[2:], self._cameras.right_T_left,
-            klt.WEIGHTS, klt.COORDINATES,
-        )  # fmt: skip
+            left[0], right[0], np.ascontiguousarray(uv), uv_right, self._cameras, klt.WEIGHTS, klt.COORDINATES
+        )
         tested = np.isfinite(misfit)
         if off is not None and tested.any():
             self._learn(sigma_px[tested])
-        typical = max(percentile(misfit[tested], TYPICAL), MIN_MISFIT) if tested.any() else MIN_MISFIT
+        typical = max(percentile(misfit[tested], PERCENTILE), MIN_MISFIT) if tested.any() else MIN_MISFIT
         off = np.fmax(0.0 if off is None else off, np.linalg.norm(fitted - uv_right, axis=1))
         config = self._config
         failed = (
@@ -232,8 +213,3 @@ class StereoMatcher:
         total = self._matches + len(sigma_px)
         self._sigma_px += len(sigma_px) / total * (max(median(sigma_px), INTERPOLATION) - self._sigma_px)
         self._matches = min(total, LEARNED)
-
-    def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
-        """Virtual right pixels from a depth image, NaN at holes and edges, and where they are finite."""
-        uv_right = points_from_depth(self._rig, depth, uv)[1]
-        return uv_right, np.isfinite(uv_right[:, 0])

@@ -22,11 +22,6 @@ class StereoCameras(NamedTuple):
     left_T_right: F64
     right_T_left: F64
 
-    @property
-    def cams(self) -> tuple[int, F64, int, F64]:
-        """(model_l, params_l, model_r, params_r)."""
-        return self.model_l, self.params_l, self.model_r, self.params_r
-
     @staticmethod
     def of(rig: Rig) -> StereoCameras:
         """Raises StereoSfmError for a rig with one camera."""

@@ -11,18 +11,14 @@ import cv2
 import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit, project_one, unproject_one
-from stereo_sfm.types import F64, I32, U8
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
+from stereo_sfm.types import F64, U8
 
 PATCH = 4  # half size of the search patch, in pixels of the search level
 SIZE = 2 * PATCH + 1
 AREA = SIZE * SIZE
 SHORT = 8  # pixels side by side, of which fewer are compared one by one
 NODES = 4  # candidates from one that is projected to the next, between which the curve is all but straight
-
-
-def patch_sums(image: U8) -> I32:
-    """(H, W) sum of the search patch around each pixel."""
-    return cv2.boxFilter(image, cv2.CV_32S, (SIZE, SIZE), normalize=False).astype(np.int32, copy=False)
 
 
 @inner
@@ -53,9 +49,7 @@ def _curve(bx, by, bz, model, params, right_T_left, min_depth, where):
 
 
 @njit
-def _candidates(
-    left, shape, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, where, pixels, templates
-):
+def _candidates(left, shape, uv, scale, cameras, min_depth, where, pixels, templates):
     """The candidates' positions (N, C, 2) in the full right image, `shape` of the level, see `search_epipolar`.
 
     Written too: their pixels (N, C, 2) of the level, -1 where the patch leaves the image, and templates (N, AREA).
@@ -69,11 +63,11 @@ def _candidates(
         if iu < PATCH or iv < PATCH or iu >= w - PATCH or iv >= h - PATCH:
             continue
         # the patch is cut at whole pixels: search for that pixel's own bearing
-        bx, by, bz = unproject_one(model_l, params_l, iu * scale, iv * scale)
+        bx, by, bz = unproject_one(cameras.model_l, cameras.params_l, iu * scale, iv * scale)
         if math.isnan(bx):
             continue
         _cut(left, iu, iv, templates[k])
-        _curve(bx, by, bz, model_r, params_r, right_T_left, min_depth, where[k])
+        _curve(bx, by, bz, cameras.model_r, cameras.params_r, cameras.right_T_left, min_depth, where[k])
         for c in range(pixels.shape[1]):
             if not math.isnan(where[k, c, 0]):
                 u, v = int(round(where[k, c, 0] * share)), int(round(where[k, c, 1] * share))
@@ -85,6 +79,7 @@ def _candidates(
 def _costs(right, right_sums, pixels, templates, cost):
     """Mean-free mean differences (N, C) of patches around pixels (N, C, 2) to templates (N, AREA), 1e9 without pixel.
 
+    `right_sums`: (H, W) int32, the sum of the patch around each pixel.
     Differences are summed AREA times too large, so that they are whole numbers. Successive pixels lie mostly side by
     side in a row: those are compared together.
     """
@@ -169,14 +164,9 @@ def _clear_best(where, cost, uv, scale, max_cost, ratio, out):
 def search_epipolar(
     left: U8,
     right: U8,
-    right_sums: I32,
     uv: F64,
     scale: float,
-    model_l: int,
-    params_l: F64,
-    model_r: int,
-    params_r: F64,
-    right_T_left: F64,
+    cameras: StereoCameras,
     min_depth: float,
     candidates: int,
     max_cost: float,
@@ -188,8 +178,7 @@ def search_epipolar(
 
     Args:
         left, right: (H, W) uint8, one pyramid level whose pixels are `scale` pixels of the full image.
-        right_sums: (H, W) int32, the sum of the patch around each pixel of `right` (`patch_sums`).
-        uv: (N, 2) px of the full left image. right_T_left: (4, 4). min_depth: metres, nearest distance searched.
+        uv: (N, 2) px of the full left image. min_depth: metres, nearest distance searched.
         candidates: how many inverse distances. max_cost: grey levels a pixel. ratio: the second best cost, away from
             the best, must be at least this much larger.
 
@@ -199,17 +188,15 @@ def search_epipolar(
     n, out = len(uv), np.full((len(uv), 2), np.nan)
     where, cost = np.empty((n, candidates, 2)), np.empty((n, candidates))
     pixels, templates = np.empty((n, candidates, 2), np.int64), np.empty((n, AREA), np.int32)
-    _candidates(
-        left, right.shape, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, where, pixels,
-        templates,
-    )  # fmt: skip
-    _costs(right, right_sums, pixels, templates, cost)
+    sums = cv2.boxFilter(right, cv2.CV_32S, (SIZE, SIZE), normalize=False).astype(np.int32, copy=False)
+    _candidates(left, right.shape, uv, scale, cameras, min_depth, where, pixels, templates)
+    _costs(right, sums, pixels, templates, cost)
     _clear_best(where, cost, uv, scale, max_cost, ratio, out)
     return out
 
 
 @njit
-def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_right, sigma):
+def triangulate(uv_left, uv_right, cameras, sigma):
     """Distance of stereo matches along the left bearing, by least squares in the right image's epipolar direction.
 
     Returns:
@@ -217,17 +204,11 @@ def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_
         px along the epipolar curve; offset (N, 2) px from it to the right observation. NaN where impossible.
     """
     n = uv_left.shape[0]
-    bearing = np.full((n, 3), np.nan)
-    rho = np.full(n, np.nan)
-    variance = np.full(n, np.nan)
-    offset = np.full((n, 2), np.nan)
-    right_T_left = np.zeros((3, 4))
-    for i in range(3):
-        for j in range(3):
-            right_T_left[i, j] = left_T_right[j, i]
-            right_T_left[i, 3] -= left_T_right[j, i] * left_T_right[j, 3]
+    bearing, offset = np.full((n, 3), np.nan), np.full((n, 2), np.nan)
+    rho, variance = np.full(n, np.nan), np.full(n, np.nan)
+    model_r, params_r, right_T_left = cameras.model_r, cameras.params_r, cameras.right_T_left
     for k in range(n):
-        bx, by, bz = unproject_one(model_l, params_l, uv_left[k, 0], uv_left[k, 1])
+        bx, by, bz = unproject_one(cameras.model_l, cameras.params_l, uv_left[k, 0], uv_left[k, 1])
         if math.isnan(bx) or math.isnan(uv_right[k, 0]):
             continue
         dx = right_T_left[0, 0] * bx + right_T_left[0, 1] * by + right_T_left[0, 2] * bz

@@ -36,7 +36,7 @@ SUSPECTED = "the right camera seems to have turned suddenly"  # how what is susp
 # that counts for: a few, so that nothing is sudden while the sequence is new.
 USUAL, USUAL_IMAGES = 2e-4, 4.0
 REMEMBERED_IMAGES = 100.0  # after which what was usual is forgotten
-FOLLOWED_SIGMAS, FOLLOWED_SHARE = 3.0, 0.5  # and share of the rotation, of what the camera turns by after it
+FOLLOWED_SIGMAS = 3.0  # of what the camera turns by after it, within which it stays
 
 
 class SuddenTurns:
@@ -71,7 +71,7 @@ class SuddenTurns:
         of, at = of[seen], at[seen]
         turn, covariance, count = _turn(
             pose_before, pose, tracks.origin[of], tracks.direction[of], tracks.rho[of],
-            before.uv[at], before.uv_right[at], tracks.uv[of], tracks.uv_right[of], cameras.cams, cameras.right_T_left,
+            before.uv[at], before.uv_right[at], tracks.uv[of], tracks.uv_right[of], cameras,
         )  # fmt: skip
         if count < MIN_POINTS:
             return False
@@ -89,7 +89,8 @@ class SuddenTurns:
             return False
         followed, uncertain = self._followed[0] + turn, self._followed[1] + usual
         self._followed = followed, uncertain
-        stays = Estimate(followed, usual).reach < FOLLOWED_SHARE * Estimate(self.turn, usual).reach
+        # nearer to where it has turned to than to where it was
+        stays = Estimate(followed, usual).reach < 0.5 * Estimate(self.turn, usual).reach
         if sudden or not (stays or Estimate(followed, uncertain).reach < FOLLOWED_SIGMAS):
             self._forget()
             return True
@@ -122,7 +123,7 @@ class SuddenTurns:
 
 
 @njit
-def _turn(pose_a, pose_b, origin, direction, rho, left_a, right_a, left_b, right_b, cams, right_T_left):
+def _turn(pose_a, pose_b, origin, direction, rho, left_a, right_a, left_b, right_b, cameras):
     """The rotation of the right camera between two images, by iteratively re-weighted least squares.
 
     Unknown is what else the second image's pose is wrong by, too: a step that is too long changes disparities.
@@ -136,10 +137,8 @@ def _turn(pose_a, pose_b, origin, direction, rho, left_a, right_a, left_b, right
     count, off, jac = 0, np.zeros((len(rho), 4)), np.zeros((len(rho), 4, 9))
     first, unused = np.zeros(4), np.zeros((4, 9))
     for k in range(len(rho)):
-        _residuals(pose_a, origin[k], direction[k], rho[k], left_a[k], right_a[k], cams, right_T_left, first, unused)
-        _residuals(
-            pose_b, origin[k], direction[k], rho[k], left_b[k], right_b[k], cams, right_T_left, off[count], jac[count]
-        )
+        _residuals(pose_a, origin[k], direction[k], rho[k], left_a[k], right_a[k], cameras, first, unused)
+        _residuals(pose_b, origin[k], direction[k], rho[k], left_b[k], right_b[k], cameras, off[count], jac[count])
         for i in range(4):
             off[count, i] -= first[i]
         if not math.isnan(off[count].sum()):
@@ -185,13 +184,13 @@ def _turn(pose_a, pose_b, origin, direction, rho, left_a, right_a, left_b, right
 
 
 @njit
-def _residuals(pose, origin, direction, rho, uv_l, uv_r, cams, right_T_left, off, jac):
+def _residuals(pose, origin, direction, rho, uv_l, uv_r, cameras, off, jac):
     """A point's residuals `off` (4,) px and their derivatives; NaN where a camera does not see it.
 
     Left, and right beyond left: what the left image is tracked wrong by, the right one is, too. `jac`: (4, 9) by
     translation and rotation of the left camera's axes, and by the right camera's turn.
     """
-    model_l, params_l, model_r, params_r = cams
+    right_T_left = cameras.right_T_left
     p, q, by_p, by_q = np.zeros(3), np.zeros(3), np.zeros((2, 3)), np.zeros(3)
     for i in range(3):
         for j in range(3):
@@ -200,8 +199,8 @@ def _residuals(pose, origin, direction, rho, uv_l, uv_r, cams, right_T_left, off
         q[i] = right_T_left[i, 3]
         for j in range(3):
             q[i] += right_T_left[i, j] * p[j]
-    left = project_one(model_l, params_l, p[0], p[1], p[2])
-    right = project_one(model_r, params_r, q[0], q[1], q[2])
+    left = project_one(cameras.model_l, cameras.params_l, p[0], p[1], p[2])
+    right = project_one(cameras.model_r, cameras.params_r, q[0], q[1], q[2])
     for i in range(2):
         off[i] = uv_l[i] - left[i]
         off[2 + i] = uv_r[i] - right[i] - off[i]

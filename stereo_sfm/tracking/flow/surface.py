@@ -30,13 +30,13 @@ DAMPING = 0.02  # of the plane's slopes, as a share of the information about the
 
 
 @njit
-def _epipolar(model_r, params_r, right_T_left, ur, vr):
+def _epipolar(cameras, ur, vr):
     """Unit direction (2,) px in the right image towards nearer points; NaN if undefined."""
-    ex, ey, ez = unproject_one(model_r, params_r, ur, vr)
+    ex, ey, ez = unproject_one(cameras.model_r, cameras.params_r, ur, vr)
     if math.isnan(ex):
         return math.nan, math.nan
-    p = project_one(model_r, params_r, ex, ey, ez)
-    t = right_T_left
+    p = project_one(cameras.model_r, cameras.params_r, ex, ey, ez)
+    t = cameras.right_T_left
     du = p[2] * t[0, 3] + p[3] * t[1, 3] + p[4] * t[2, 3]
     dv = p[5] * t[0, 3] + p[6] * t[1, 3] + p[7] * t[2, 3]
     n = math.sqrt(du * du + dv * dv)
@@ -46,12 +46,12 @@ def _epipolar(model_r, params_r, right_T_left, ur, vr):
 
 
 @njit
-def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weights, coordinates):
+def fit_planes(left, right, uv, uv_right, cameras, weights, coordinates):
     """Disparity planes of matched windows, and their residuals.
 
     Args:
         left, right: (H, W) uint8. uv, uv_right: (N, 2) px, matches to a fraction of a pixel; NaN is skipped.
-        model_r, params_r, right_T_left (4, 4): the right camera. weights, coordinates: klt.WEIGHTS, klt.COORDINATES.
+        cameras: StereoCameras. weights, coordinates: klt.WEIGHTS, klt.COORDINATES.
 
     Returns:
         (N, 2) px in the right image: the match with the plane taken into account. (N,) the worst cell's mean squared
@@ -71,7 +71,7 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
         u, v, ur, vr = uv[k, 0], uv[k, 1], uv_right[k, 0], uv_right[k, 1]
         if math.isnan(ur) or not (_inside(left, u, v, HALF + 1.5) and _inside(right, ur, vr, HALF + 0.5)):
             continue
-        eu, ev = _epipolar(model_r, params_r, right_T_left, ur, vr)
+        eu, ev = _epipolar(cameras, ur, vr)
         if math.isnan(eu):
             continue
         sample_wide(left, u - HALF, v - HALF, wide)

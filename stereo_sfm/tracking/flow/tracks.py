@@ -7,9 +7,9 @@ from operator import attrgetter
 
 import numpy as np
 
-from stereo_sfm.tracking.flow.window_curvature import RAYS
-from stereo_sfm.tracking.flow.windows import FLAT_SIZE
-from stereo_sfm.types import F32, F64, I32, I64, Bool
+from stereo_sfm.tracking.flow.klt import Appearances
+from stereo_sfm.tracking.flow.window_curvature import OFFSETS
+from stereo_sfm.types import F64, I32, I64, Bool
 
 
 @dataclass
@@ -64,12 +64,8 @@ class Patches:
     """First appearances of points, in reusable slots."""
 
     def __init__(self, capacity: int) -> None:
-        self.patch: F32 = np.zeros((capacity, FLAT_SIZE), np.float32)
-        self.gradients: F32 = np.zeros((capacity, 2, FLAT_SIZE), np.float32)
-        self.inverse_normal: F64 = np.zeros((capacity, 6, 6))
-        self.contrast: F64 = np.zeros(capacity)
-        self.bending: F64 = np.zeros((capacity, 6, 6))
-        self.rays: F64 = np.zeros((capacity, RAYS, 3))  # odometry axes
+        self.windows = Appearances.empty(capacity)
+        self.rays: F64 = np.zeros((capacity, len(OFFSETS), 3))  # around their centres, odometry axes
         self.origin: F64 = np.zeros((capacity, 3))  # of the camera, odometry frame
         self._free = np.ones(capacity, bool)
 

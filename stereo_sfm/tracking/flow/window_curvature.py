@@ -18,21 +18,15 @@ from stereo_sfm.geometry.se3_kernels import dot, transform_point
 from stereo_sfm.types import F64
 
 STEP = 5.0  # px of the differences
-RIGHT, LEFT, DOWN, UP, BOTH, NEITHER, ALONG_X, ALONG_Y = range(1, 9)  # rays beside the centre's, and differences
+# From the centre of a window: 0, right, left, down, up, right and down, left and up.
 OFFSETS = STEP * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], float)
-RAYS = len(OFFSETS) + 2  # with the differences
 MAX_CURVATURE = 0.1  # 1/px, sum of the coefficients of a moderate deformation
 
 
 def window_rays(camera: Camera, uv: F64, odom_R_cam: F64) -> F64:
-    """(N, 9, 3) unit rays of windows (N, 2) px at OFFSETS, and their changes per pixel along x and y; odometry axes.
-
-    NaN out of view.
-    """
+    """(N, 7, 3) unit rays of windows (N, 2) px at OFFSETS, odometry axes; NaN out of view."""
     rays = camera.unproject((uv[:, None] + OFFSETS).reshape(-1, 2)) @ odom_R_cam.T
-    rays = rays.reshape(-1, len(OFFSETS), 3)
-    along = [(rays[:, last] - rays[:, first]) / (2 * STEP) for last, first in ((RIGHT, LEFT), (DOWN, UP))]
-    return np.concatenate([rays, np.stack(along, axis=1)], axis=1)
+    return rays.reshape(-1, len(OFFSETS), 3)
 
 
 @njit
@@ -40,7 +34,7 @@ def _plane(rays, base, rho, warp, turn, model, params, normal):
     """The plane n X = 1, `normal` (3,), whose image a camera's motion deforms by a warp (2, 2).
 
     Args:
-        rays: (9, 3) of its window; rho: 1/m along the first; base: (3,) m from the camera in which it is deformed to
+        rays: (7, 3) of its window; rho: 1/m along the first; base: (3,) m from the camera in which it is deformed to
             the one where it is not; in odometry axes. turn: (4, 4) from these to the axes of the former.
     """
     x, y, z = rays[0, 0] + rho * base[0], rays[0, 1] + rho * base[1], rays[0, 2] + rho * base[2]
@@ -49,7 +43,7 @@ def _plane(rays, base, rho, warp, turn, model, params, normal):
     for i in range(3):
         du[i] = p[2] * turn[0, i] + p[3] * turn[1, i] + p[4] * turn[2, i]
         dv[i] = p[5] * turn[0, i] + p[6] * turn[1, i] + p[7] * turn[2, i]
-    dx, dy = rays[ALONG_X], rays[ALONG_Y]
+    dx, dy = (rays[1] - rays[2]) / (2 * STEP), (rays[3] - rays[4]) / (2 * STEP)
     mu, mv = dot(du, base), dot(dv, base)  # px by which a pixel moves for a change of rho
     power = mu * mu + mv * mv + 1 / (rho * rho)  # with less parallax than a pixel the plane faces the camera
     slope_x = (mu * (warp[0, 0] - dot(du, dx)) + mv * (warp[1, 0] - dot(dv, dx))) / power
@@ -69,11 +63,11 @@ def window_curvatures(slots, rays, origin, points, warp, last, new, model, param
     c_k = q_k0 x^2 / 2 + q_k1 x y + q_k2 y^2 / 2.
 
     Args:
-        slots: (N,) rows of rays (M, 9, 3), see `window_rays`, and origin (M, 3): cameras' positions, odometry frame.
+        slots: (N,) rows of rays (M, 7, 3), see `window_rays`, and origin (M, 3): cameras' positions, odometry frame.
         points: (N, 3), odometry frame. warp: (N, 2, 2) of an earlier image. last, new: (4, 4) odom_T_cam of that image
             and of the new one. model, params: of the lens. out: (N, 6) 1/px, q; zero where it is not known.
     """
-    base, normal, at, second = np.zeros(3), np.zeros(3), np.zeros((2, 7)), np.zeros((2, 3))
+    base, normal, at, second = np.zeros(3), np.zeros(3), np.zeros((2, len(OFFSETS))), np.zeros((2, 3))
     to_last, to_new = last.T.copy(), new.T.copy()  # the first three rows turn odometry axes, and move nothing
     for row in range(slots.shape[0]):
         k, q = slots[row], out[row]
@@ -88,18 +82,18 @@ def window_curvatures(slots, rays, origin, points, warp, last, new, model, param
         _plane(r, base, 1.0 / distance, warp[row], to_last, model, params, normal)
         for i in range(3):
             base[i] = origin[k, i] - new[i, 3]
-        for n in range(7):
+        for n in range(len(OFFSETS)):
             rho = dot(r[n], normal)
             x, y, z = r[n, 0] + rho * base[0], r[n, 1] + rho * base[1], r[n, 2] + rho * base[2]
             x, y, z = transform_point(to_new, x, y, z)
             p = project_one(model, params, x, y, z)
             at[0, n], at[1, n] = p[0], p[1]
         for i in range(2):
-            across, along = at[i, RIGHT] + at[i, LEFT], at[i, DOWN] + at[i, UP]
+            across, along = at[i, 1] + at[i, 2], at[i, 3] + at[i, 4]
             second[i, 0], second[i, 2] = across - 2 * at[i, 0], along - 2 * at[i, 0]
-            second[i, 1] = 0.5 * (at[i, BOTH] + at[i, NEITHER] + 2 * at[i, 0] - across - along)
-        a, b = at[0, RIGHT] - at[0, LEFT], at[0, DOWN] - at[0, UP]  # the affine part, times 2 STEP
-        c, d = at[1, RIGHT] - at[1, LEFT], at[1, DOWN] - at[1, UP]
+            second[i, 1] = 0.5 * (at[i, 5] + at[i, 6] + 2 * at[i, 0] - across - along)
+        a, b = at[0, 1] - at[0, 2], at[0, 3] - at[0, 4]  # the affine part, times 2 STEP
+        c, d = at[1, 1] - at[1, 2], at[1, 3] - at[1, 4]
         scale, largest = 2 / ((a * d - b * c) * STEP), 0.0
         for n in range(3):
             q[n] = scale * (d * second[0, n] - b * second[1, n])
