@@ -1,4 +1,4 @@
-"""Compiled inner loop of `mapping.rig_window`: normal equations of one window with its points eliminated.
+"""Compiled inner loop of `calibration.rig_window`: normal equations of one window with its points eliminated.
 
 Unknown are eight terms of the rig (rotation of the right camera, direction of the baseline, focal ratio, decentering of
 the right lens), what both lenses share, six numbers of every moment after the first, and of each point its bearing (2)

@@ -18,11 +18,11 @@ import numpy as np
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
+from stereo_sfm.calibration import rig_window_kernels
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import rectifying_rotations
-from stereo_sfm.mapping import rig_window_kernels
 from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
 
 # Of a window: so many leave seven rows for each of its unknowns; more say little, as windows have errors of their own.
