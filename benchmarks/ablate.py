@@ -33,7 +33,7 @@ from _ablate_rules import RULES
 from _real_sequences import SEQUENCES, real_root
 from _sequences import ROOT
 
-CORE = ("tracking", "papers", "mapping", "loop", "maps")
+CORE = ("tracking", "papers", "calibration", "mapping", "loop", "maps")
 PACKAGES = ("stereo_sfm", "drivers", "calib")
 RUNNER = Path(__file__).with_name("_ablate_run.py")
 LONGEST_S = 1800.0

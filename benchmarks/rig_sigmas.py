@@ -24,9 +24,9 @@ import numpy as np
 from _real_sequences import FOLDER, SEQUENCES, real_root
 from _runs import recorded_of
 
+from stereo_sfm.calibration.rig_window import PRIOR, RigWindow
+from stereo_sfm.calibration.self_calibration import SelfCalibration
 from stereo_sfm.config import Config
-from stereo_sfm.mapping.rig_window import PRIOR, RigWindow
-from stereo_sfm.mapping.self_calibration import SelfCalibration
 from stereo_sfm.types import F64
 
 KNOWN = 0.5  # of the prior deviation: what a half must know of a term

@@ -21,6 +21,7 @@ import numpy as np
 
 from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
 from stereo_sfm.calib.choice import Estimate
+from stereo_sfm.calib.elimination import Eliminated, point_noise, robust_weights
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import (
     DIRECTION,
@@ -32,10 +33,8 @@ from stereo_sfm.calib.scene_model import (
     make_problem,
     moved,
     part,
-    tangents,
 )
 from stereo_sfm.calib.tracks import Window
-from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, RIG_TERMS, Bool
 
 HALF_ITERATIONS = 10
@@ -194,86 +193,19 @@ def _fit(rig: Rig, problems: list[Problem], lens: Lens, vector: F64, sigma: floa
         current = moved(rig, vector)
         information = lens.information(vector)
         hessian, gradient = np.diag(information), vector * information
-        steps: list[tuple[Problem, _Solved]] = []
+        steps: list[tuple[Problem, Eliminated]] = []
         sizes: list[F64] = []
         for problem in problems:
             residual, by_point, by_rest = linearised(current, problem, vector)
-            sizes.append(_point_noise(residual))
-            problem.weight = _weights(residual, sigma, hard=iteration >= iterations // 2)
-            h, g, solved = _reduced(problem, residual, by_point, by_rest, sigma)
-            hessian, gradient = hessian + h, gradient + g
+            sizes.append(point_noise(residual))
+            problem.weight = robust_weights(residual, 3 * sigma, 6 * sigma if iteration >= iterations // 2 else np.inf)
+            weight = problem.weight / (CORRELATED * sigma) ** 2
+            solved = Eliminated.of(residual, by_point, by_rest, weight, SHARED)
+            hessian, gradient = hessian + solved.matrix, gradient + solved.gradient
             steps.append((problem, solved))
         delta = np.asarray(-np.linalg.solve(hessian, gradient), float)
         for problem, solved in steps:
-            _apply(problem, delta, solved)
+            solved.apply(delta, problem)
         vector = vector + delta
         sigma = float(np.clip(np.median(np.concatenate(sizes)), 0.1, 30.0))
     return _Fit(vector, np.asarray(np.linalg.inv(hessian), float), sigma)
-
-
-def _point_noise(residual: F64) -> F64:
-    """(N,) each point's own estimate of the noise of a coordinate, scaled so that the median is unbiased.
-
-    A point's three unknowns leave one of four rows, five of eight, and so on; the median of chi-squared with k degrees
-    of freedom is k (1 - 2 / 9k)^3 (Wilson and Hilferty, PNAS 17, 1931).
-    """
-    rows = np.isfinite(residual).sum(1)
-    usable = rows >= 4
-    free = rows[usable] - 3
-    size = np.sqrt(np.nansum(residual[usable] ** 2, 1) / free)
-    return size / (1 - 2 / (9 * free)) ** 1.5
-
-
-def _weights(residual: F64, sigma: float, hard: bool) -> F64:
-    """Cauchy weights by the worst row of a point at a moment; zero for missing rows and, if `hard`, gross outliers."""
-    count, rows = residual.shape
-    size = np.abs(np.nan_to_num(residual)).reshape(count, rows // 4, 4).max(2)
-    worst = np.repeat(size, 4, axis=1)
-    weight = 1 / (1 + (worst / (3 * sigma)) ** 2)
-    if hard:
-        weight = np.where(worst > 6 * sigma, 0.0, weight)
-    return np.where(np.isfinite(residual), weight, 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """Back-substitution of a window's own unknowns: step = -(gradient + gain @ step of the other unknowns)."""
-
-    pose_gain: F64  # (6 (F - 1), SHARED)
-    pose_gradient: F64
-    point_gain: F64  # (N, 3, R)
-    point_gradient: F64  # (N, 3)
-
-
-def _reduced(problem: Problem, residual: F64, by_point: F64, by_rest: F64, sigma: float) -> tuple[F64, F64, _Solved]:
-    """Normal equations of the shared unknowns with the window's points and poses eliminated."""
-    weight = problem.weight / (CORRELATED * sigma) ** 2
-    r = np.nan_to_num(residual)
-    wp = np.swapaxes(by_point * weight[..., None], 1, 2)
-    h_pp = wp @ by_point
-    damping = 1e-9 + 1e-9 * np.trace(h_pp, axis1=1, axis2=2)
-    inverse = np.linalg.inv(h_pp + damping[:, None, None] * np.eye(3))
-    h_pr = wp @ by_rest  # (N, 3, R)
-    point_gain, point_gradient = inverse @ h_pr, -(inverse @ (wp @ r[..., None]))[..., 0]
-    flat, weights = by_rest.reshape(-1, by_rest.shape[2]), weight.reshape(-1)
-    h = flat.T @ (flat * weights[:, None]) - np.tensordot(h_pr, point_gain, ((0, 1), (0, 1)))
-    g = -(flat * weights[:, None]).T @ r.reshape(-1) - np.tensordot(h_pr, point_gradient, ((0, 1), (0, 1)))
-    own = h[SHARED:, SHARED:] + 1e-6 * np.eye(len(h) - SHARED)
-    pose_gain = np.asarray(np.linalg.solve(own, h[SHARED:, :SHARED]), float)
-    pose_gradient = np.asarray(np.linalg.solve(own, g[SHARED:]), float)
-    solved = _Solved(pose_gain, pose_gradient, point_gain, point_gradient)
-    across = h[:SHARED, SHARED:]
-    reduced = np.asarray(h[:SHARED, :SHARED] - across @ pose_gain, float)
-    return reduced, np.asarray(g[:SHARED] - across @ pose_gradient, float), solved
-
-
-def _apply(problem: Problem, shared: F64, solved: _Solved) -> None:
-    """Back-substitute the shared step into the window's poses and points."""
-    pose = -(solved.pose_gradient + solved.pose_gain @ shared)
-    step = -(solved.point_gradient + solved.point_gain @ np.concatenate([shared, pose]))
-    directions = tangents(problem.bearing)
-    turned = problem.bearing + (directions @ step[:, :2, None])[..., 0]
-    problem.bearing = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-    problem.rho = problem.rho + step[:, 2]
-    for f, twist in enumerate(pose.reshape(-1, 6), 1):
-        problem.frame_T_first[f] = se3.exp(twist) @ problem.frame_T_first[f]

@@ -32,6 +32,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.presets",
     "stereo_sfm.tracking",
     "stereo_sfm.papers",
+    "stereo_sfm.calibration",
     "stereo_sfm.mapping",
     "stereo_sfm.loop",
     "stereo_sfm.log",  # a file format as well, which one of the drivers reads
@@ -51,7 +52,14 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.commands",
     "stereo_sfm.cli",
 )
-CORE = ("stereo_sfm.geometry", "stereo_sfm.tracking", "stereo_sfm.papers", "stereo_sfm.mapping", "stereo_sfm.loop")
+CORE = (
+    "stereo_sfm.geometry",
+    "stereo_sfm.tracking",
+    "stereo_sfm.papers",
+    "stereo_sfm.calibration",
+    "stereo_sfm.mapping",
+    "stereo_sfm.loop",
+)
 SHELL_ONLY = {
     "time",
     "datetime",

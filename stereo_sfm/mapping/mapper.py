@@ -41,6 +41,9 @@ import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calibration.row_errors import RowMonitor
+from stereo_sfm.calibration.self_calibration import Revision, SelfCalibration
+from stereo_sfm.calibration.sensor_calibration import SensorCalibration
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import culling, window
@@ -50,10 +53,7 @@ from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.level import down_of
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.protocol import AnyMapper
-from stereo_sfm.mapping.recalibration import calibration_update, recalibrate
-from stereo_sfm.mapping.row_errors import RowMonitor
-from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
-from stereo_sfm.mapping.sensor_calibration import SensorCalibration
+from stereo_sfm.mapping.recalibration import recalibrate
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
@@ -252,7 +252,7 @@ class Mapper(AnyMapper):
         assert self._calibration is not None
         row, applied = len(self.map.keyframes) - 1, self._calibration.applies
         kf_id, stamp_ns = int(self.map.keyframes.kf_id[row]), int(self.map.keyframes.stamp_ns[row])
-        self._revised = calibration_update(revision, self._version, kf_id, stamp_ns, applied)
+        self._revised = revision.message(self._version, kf_id, stamp_ns, applied)
         if applied:
             self._terms = revision.terms
             changes = [*revision.on_the_way, (revision.since_kf_id, revision.terms)]

@@ -12,17 +12,8 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.mapping.self_calibration import Revision
 from stereo_sfm.mapping.triangulate import triangulate
-from stereo_sfm.types import I64, CalibrationUpdate, Corners
-
-
-def calibration_update(revision: Revision, version: int, kf_id: int, stamp_ns: int, applied: bool) -> CalibrationUpdate:
-    """The message of a revision, with the map update and the keyframe that bring it."""
-    return CalibrationUpdate(
-        version, kf_id, stamp_ns, revision.terms, revision.covariance, revision.since_kf_id, applied, revision.why,
-        revision.text,
-    )  # fmt: skip
+from stereo_sfm.types import I64, Corners
 
 
 def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calibration.self_calibration import SelfCalibration
+from stereo_sfm.calibration.sensor_calibration import SensorCalibration
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
-from stereo_sfm.mapping.self_calibration import SelfCalibration
-from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 from stereo_sfm.maps.localizer import Localizer
 from stereo_sfm.maps.relocalization import Location
 from stereo_sfm.timing import NoSpans

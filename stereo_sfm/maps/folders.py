@@ -75,9 +75,9 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
         raise StereoSfmError("maps need the mapper: set mapper.enabled=true, or omit --map-in and --map-out")
     if folders.localize_only and not config.mapper.enabled and not config.loop.enabled:
         raise StereoSfmError("--localize-only needs place recognition: set loop.enabled=true")
+    from stereo_sfm.calibration.self_calibration import SelfCalibration
+    from stereo_sfm.calibration.sensor_calibration import SensorCalibration
     from stereo_sfm.mapping.mapper import Mapper
-    from stereo_sfm.mapping.self_calibration import SelfCalibration
-    from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 
     wanted = SelfCalibration.from_config(config, rig) if config.mapper.enabled else None
     sensors = SensorCalibration.from_config(config, rig)

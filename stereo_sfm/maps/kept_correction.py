@@ -8,8 +8,8 @@ import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.mapping.rig_window import PRIOR
-from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
+from stereo_sfm.calibration.rig_window import PRIOR
+from stereo_sfm.calibration.self_calibration import Revision, SelfCalibration
 from stereo_sfm.types import F64, Keyframe
 
 

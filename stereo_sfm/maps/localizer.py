@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calibration.self_calibration import SelfCalibration
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import within
 from stereo_sfm.mapping.level import mean_down
 from stereo_sfm.mapping.protocol import AnyMapper
-from stereo_sfm.mapping.recalibration import calibration_update
-from stereo_sfm.mapping.self_calibration import SelfCalibration
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.types import F64, RIG_TERMS, CalibrationUpdate, Keyframe, LoopResult, MapUpdate
 
@@ -77,7 +76,7 @@ class Localizer(AnyMapper):
         if self._calibration.applies:
             self._terms, self.rig = revision.terms, with_terms(self._source_rig, revision.terms)
         where = self._version, keyframe.kf_id, keyframe.stamp_ns
-        return calibration_update(revision, *where, self._calibration.applies)
+        return revision.message(*where, self._calibration.applies)
 
     def relocalize(self) -> None:
         """Do not trust the prediction: search the whole map with the next keyframe."""

@@ -149,8 +149,8 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
 
     Args: patient, images may wait for code: only that of the first one is loaded, the rest when it is called.
     """
-    from stereo_sfm.mapping.rig_window import SeenPoints, solve_window
-    from stereo_sfm.mapping.self_calibration import SelfCalibration
+    from stereo_sfm.calibration.rig_window import SeenPoints, solve_window
+    from stereo_sfm.calibration.self_calibration import SelfCalibration
 
     if stage == "tracker":
         tracker = make_tracker(config, rig)

@@ -11,6 +11,7 @@ import pytest
 
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calibration.self_calibration import SelfCalibration
 from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.sim.source import SimSource
@@ -20,7 +21,6 @@ from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
-from stereo_sfm.mapping.self_calibration import SelfCalibration
 from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.extension import Extension
 from stereo_sfm.maps.folders import MapFolders, make_mapper, saved_map_of

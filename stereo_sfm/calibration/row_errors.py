@@ -1,7 +1,7 @@
 """Online check of the calibration: distances of stereo matches from their epipolar curves by region, and their trend.
 
 Noise is symmetric, so the median of a region is the calibration's error there. The difference of a fast and a slow
-average over the keyframes shows whether it grows. Errors of disparity are not visible (`mapping.self_calibration`
+average over the keyframes shows whether it grows. Errors of disparity are not visible (`calibration.self_calibration`
 estimates them too).
 """
 

@@ -10,11 +10,11 @@ import pytest
 
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calibration.row_errors import RowMonitor
+from stereo_sfm.calibration.self_calibration import KEYFRAMES, MIN_WINDOWS, Revision, SelfCalibration
 from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
-from stereo_sfm.mapping.row_errors import RowMonitor
-from stereo_sfm.mapping.self_calibration import KEYFRAMES, MIN_WINDOWS, Revision, SelfCalibration
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe
 from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around, turned
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereo_sfm.mapping.rig_course import Course, Scatter, constant, steady
-from stereo_sfm.mapping.rig_window import RigInformation, RigWindow
+from stereo_sfm.calibration.rig_course import Course, Scatter, constant, steady
+from stereo_sfm.calibration.rig_window import RigInformation, RigWindow
 from stereo_sfm.types import F64, RIG_TERMS
 
 STATED = 2e-4  # standard deviation that windows state

@@ -9,10 +9,10 @@ import pytest
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.sensor_terms import with_sensor_terms
+from stereo_sfm.calibration.sensor_calibration import SensorCalibration
 from stereo_sfm.config import Config, load
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
-from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 from stereo_sfm.types import F64, Keyframe, SensorSamples, SensorUpdate
 from tests.sensor_drive import FRAMES, THREE_DEGREES, SensorDrive, miscalibrated
 

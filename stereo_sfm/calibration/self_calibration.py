@@ -1,15 +1,15 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
-Every few keyframes with motion form a window (`mapping.rig_window`). The terms of the rig are estimated from all
-windows with the deviations that the windows' scatter shows (`mapping.rig_course`). Terms are corrected that differ from
-the current ones by several of these, that both halves of the windows (even and odd ones) confirm, and whose correction
-by one half makes rows and reprojections of the other half better. Once one is, others follow that are likely wrong.
-The rows show terms of lenses, which change lengths by what the lens model says of disparities: lengths stay unless
-there is evidence about them. A corrected term is refined as long as windows come, first whenever their number has
-doubled; one that moves by more than its deviation allowed, and then is not significant any more, is taken back for
-good. Points are tracked where a wrong rig expects them, and agree with it a little: once there are enough windows since
-a large correction, those before it are discarded. Where the windows show drift (temperature), the rig is known to be
-wrong: the terms at the newest window are used from it on, and the windows since the last revision are on the way there.
+Every few keyframes with motion form a window (`rig_window`). The terms of the rig are estimated from all windows with
+the deviations that the windows' scatter shows (`rig_course`). Terms are corrected that differ from the current ones by
+several of these, that both halves of the windows (even and odd ones) confirm, and whose correction by one half makes
+rows and reprojections of the other half better. Once one is, others follow that are likely wrong. The rows show terms
+of lenses, which change lengths by what the lens model says of disparities: lengths stay unless there is evidence about
+them. A corrected term is refined as long as windows come, first whenever their number has doubled; one that moves by
+more than its deviation allowed, and then is not significant any more, is taken back for good. Points are tracked where
+a wrong rig expects them, and agree with it a little: once there are enough windows since a large correction, those
+before it are discarded. Where the windows show drift (temperature), the rig is known to be wrong: the terms at the
+newest window are used from it on, and the windows since the last revision are on the way there.
 
 A sudden rotation of the right camera is noticed and measured by the tracker (`tracking.flow.sudden_turn`). Once it has
 stayed for some keyframes, the rig is corrected by it from the first of these on, and what the windows before it showed
@@ -26,10 +26,10 @@ import numpy as np
 
 from stereo_sfm.calib.choice import NAMES, SCALES, SIGMAS, UNITS, Choice, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calibration.rig_course import Scatter, constant, steady
+from stereo_sfm.calibration.rig_window import LENSES, RigWindow, SeenPoints, solve_window
 from stereo_sfm.config import Config
-from stereo_sfm.mapping.rig_course import Scatter, constant, steady
-from stereo_sfm.mapping.rig_window import LENSES, RigWindow, SeenPoints, solve_window
-from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
+from stereo_sfm.types import F64, RIG_TERMS, Bool, CalibrationUpdate, Keyframe
 
 OF_ROTATION = np.arange(RIG_TERMS) < 3  # of the right camera
 KEYFRAMES = 4  # of one window, the last one may have one less; a rotation that the tracker noticed stays for as many
@@ -68,6 +68,12 @@ class Revision:
     why: str  # "significant", "step", "refined", "drift"
     text: str  # readable description
     on_the_way: tuple[tuple[int, F64], ...] = ()  # of a drift: earlier keyframes and the terms from each of them on
+
+    def message(self, version: int, kf_id: int, stamp_ns: int, applied: bool) -> CalibrationUpdate:
+        """As a message, with the map update and the keyframe that bring it."""
+        return CalibrationUpdate(
+            version, kf_id, stamp_ns, self.terms, self.covariance, self.since_kf_id, applied, self.why, self.text
+        )
 
 
 class SelfCalibration:

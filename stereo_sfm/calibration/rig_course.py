@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.calib.choice import Estimate
-from stereo_sfm.mapping.rig_window import PRIOR, RigWindow
+from stereo_sfm.calibration.rig_window import PRIOR, RigWindow
 from stereo_sfm.types import F64, RIG_TERMS, Bool
 
 ITERATIONS = 12  # of expectation-maximisation, until the scatter hardly changes

@@ -16,19 +16,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.elimination import Eliminated, point_noise, robust_weights
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.kernels import PINHOLE, RADTAN
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import rectifying_rotations
-from stereo_sfm.mapping import rig_window_kernels
-from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
+from stereo_sfm.types import F64, I64, RIG_TERMS, Bool, Keyframe
 
 # Of a window: so many leave seven rows for each of its unknowns; more say little, as windows have errors of their own.
 MIN_POINTS, MAX_POINTS = 20, 160
 STEPS = 4  # of Gauss-Newton: two that find what does not fit, two without it
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandths of a pixel
+OUTLIER_SIGMAS = 6.0  # beyond which a point at a moment does not count in the later steps
 NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit
 LENSES = slice(5, 8)  # focal ratio and decentering
 LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these
@@ -98,12 +100,11 @@ class RigWindow:
 class _Problem:
     """One window's measurements and its own unknowns."""
 
-    uv_left: F64  # (F, N, 2) px
-    uv_right: F64  # (F, N, 2) px
+    uv: F64  # (N, F, 2, 2) px in the left and the right image; nothing in the right one without the left
     bearing: F64  # (N, 3) unit, first left camera
     rho: F64  # (N,) 1/m
     frame_T_first: F64  # (F, 4, 4)
-    shapes: F64  # (2, F, N, 2, L) px
+    shapes: F64  # (N, F, 2, 2, L) px
     lens: F64  # (L,)
 
 
@@ -119,18 +120,20 @@ def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWi
         return None
     sigma = 1.0
     for step in range(STEPS):
-        system = _System.of(corrected, problem, sigma, hard=step >= 2)
-        sigma = system.noise_px
-        terms = terms + system.step(problem, terms)
+        system, sigma = _equations(corrected, problem, sigma, hard=step >= 2)
+        pulled = system.gradient + SHARED_PRIOR * np.concatenate([terms, problem.lens])
+        delta = np.asarray(-np.linalg.solve(system.matrix + np.diag(SHARED_PRIOR), pulled), float)
+        terms, problem.lens = terms + delta[:RIG_TERMS], problem.lens + delta[RIG_TERMS:]
+        system.apply(delta, problem)
         if not np.isfinite(terms).all():
             return None
         corrected = with_terms(rig, terms)
-    system = _System.of(corrected, problem, sigma, hard=True)
-    information = system.information(problem, terms)
+    system, sigma = _equations(corrected, problem, sigma, hard=True)
     last = keyframes[-1]
-    length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
+    length = _length_by_terms(rig, problem.uv[:, 0, 0], problem.uv[:, 0, 1])
     turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:]
-    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, system.noise_px, length, turn)
+    information = _information(system, terms, problem.lens)
+    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma, length, turn)
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
@@ -161,16 +164,16 @@ def _problem(rig: Rig, keyframes: Sequence[SeenPoints]) -> _Problem | None:
     ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
     if len(ids) < MIN_POINTS:
         return None
-    uv = np.full((2, len(keyframes), len(ids), 2), np.nan)
+    uv = np.full((len(ids), len(keyframes), 2, 2), np.nan)
     for f, keyframe in enumerate(keyframes):
         _, at, of = np.intersect1d(ids, keyframe.point_ids, assume_unique=True, return_indices=True)
-        uv[0, f, at], uv[1, f, at] = keyframe.uv_left[of], keyframe.uv_right[of]
-    bearing, rho = rig.left.unproject(uv[0, 0]), inverse_distances(rig, uv[0, 0], uv[1, 0])
+        uv[at, f, 0], uv[at, f, 1] = keyframe.uv_left[of], keyframe.uv_right[of]
+    uv[np.isnan(uv[:, :, 0, 0]), 1] = np.nan
+    bearing, rho = rig.left.unproject(uv[:, 0, 0]), inverse_distances(rig, uv[:, 0, 0], uv[:, 0, 1])
     good = np.isfinite(bearing).all(1) & np.isfinite(rho)
     frames = np.array([se3.inverse(k.odom_T_cam) @ first.odom_T_cam for k in keyframes])
-    uv = np.ascontiguousarray(uv[:, :, good])
-    shapes = _shapes(rig.left, uv)
-    return _Problem(uv[0], uv[1], bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
+    uv = uv[good]
+    return _Problem(uv, bearing[good], rho[good], frames, _shapes(rig.left, uv), np.zeros(len(LENS_PRIOR)))
 
 
 def _shapes(camera: Camera, uv: F64) -> F64:
@@ -186,80 +189,62 @@ def _shapes(camera: Camera, uv: F64) -> F64:
     return np.asarray(np.nan_to_num(np.stack([np.stack(u, -1), np.stack(v, -1)], -2)), float)
 
 
-@dataclass(frozen=True, eq=False)
-class _System:
-    """Normal equations of the terms with the other unknowns eliminated, and their back-substitution."""
+def _equations(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> tuple[Eliminated, float]:
+    """The equations of the rig's terms and the lens's at the problem's present state, and the noise of a coordinate.
 
-    matrix: F64  # (S, S) of the rig's terms and the lens's
-    gradient: F64  # (S,)
-    noise_px: float  # within NOISE_PX
-    pose_gain: F64  # (6 (F - 1), S)
-    pose_gradient: F64
-    point_gain: F64  # (N, 3, R)
-    point_gradient: F64  # (N, 3)
-    tangent: F64  # (N, 3, 2) of the points' bearings
-
-    @staticmethod
-    def of(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> _System:
-        """The system at the problem's present state."""
-        assert rig.right is not None
-        count, frames = len(problem.rho), len(problem.frame_T_first)
-        shared = RIG_TERMS + len(problem.lens)
-        size = shared + 6 * (frames - 1)
-        h, g = np.zeros((size, size)), np.zeros(size)
-        gain, gradient = np.zeros((count, 3, size)), np.zeros((count, 3))
-        squares, rows = np.zeros(count), np.zeros(count, np.int64)
-        tangent, rotation = tangents(problem.bearing), rig.left_T_right[:3, :3]
-        rect_R_left, _ = rectifying_rotations(rig.left_T_right)
-        rig_window_kernels.accumulate(
-            problem.uv_left, problem.uv_right, problem.bearing, tangent, problem.rho,
-            np.ascontiguousarray(problem.frame_T_first[:, :3, :3]),
-            np.ascontiguousarray(problem.frame_T_first[:, :3, 3]), problem.shapes, problem.lens,
-            (rig.left.model_id, rig.left.params, rig.right.model_id, rig.right.params),
-            np.ascontiguousarray(rotation.T), rig.left_T_right[:3, 3].copy(),
-            np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard,
-            h, g, gain, gradient, squares, rows,
-        )  # fmt: skip
-        own = h[shared:, shared:] + 1e-6 * np.eye(size - shared)
-        pose_gain = np.asarray(np.linalg.solve(own, h[shared:, :shared]), float)
-        pose_gradient = np.asarray(np.linalg.solve(own, g[shared:]), float)
-        across = h[:shared, shared:]
-        matrix, reduced = h[:shared, :shared] - across @ pose_gain, g[:shared] - across @ pose_gradient
-        return _System(
-            0.5 * (matrix + matrix.T), reduced, _noise(squares, rows), pose_gain, pose_gradient, gain, gradient, tangent
-        )
-
-    def step(self, problem: _Problem, terms: F64) -> F64:
-        """(8,) step of the terms, back-substituted into the window's lens, motion and points."""
-        pulled = self.gradient + SHARED_PRIOR * np.concatenate([terms, problem.lens])
-        delta = -np.linalg.solve(self.matrix + np.diag(SHARED_PRIOR), pulled)
-        problem.lens = problem.lens + delta[RIG_TERMS:]
-        pose = -(self.pose_gradient + self.pose_gain @ delta)
-        step = -(self.point_gradient + self.point_gain @ np.concatenate([delta, pose]))
-        turned = problem.bearing + (self.tangent @ step[:, :2, None])[..., 0]
-        problem.bearing = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-        problem.rho = problem.rho + step[:, 2]
-        problem.frame_T_first[1:] = se3.exp(pose.reshape(-1, 6)) @ problem.frame_T_first[1:]
-        return np.asarray(delta[:RIG_TERMS], float)
-
-    def information(self, problem: _Problem, terms: F64) -> RigInformation:
-        """About the rig's terms alone, whatever the lens is."""
-        own = self.matrix[RIG_TERMS:, RIG_TERMS:] + np.diag(LENS_PRIOR**-2)
-        gain = np.linalg.solve(own, self.matrix[RIG_TERMS:, :RIG_TERMS]).T
-        matrix = self.matrix[:RIG_TERMS, :RIG_TERMS] - gain @ self.matrix[RIG_TERMS:, :RIG_TERMS]
-        gradient = self.gradient[:RIG_TERMS] - gain @ (self.gradient[RIG_TERMS:] + problem.lens / LENS_PRIOR**2)
-        return RigInformation(matrix, matrix @ terms - gradient)
-
-
-def _noise(squares: F64, rows: I64) -> float:
-    """Noise of one coordinate: median over the points of their residuals, corrected for the median's bias.
-
-    A point's three unknowns leave k of its rows free; the median of chi-squared with k degrees of freedom is
-    k (1 - 2 / 9k)^3 (Wilson and Hilferty, PNAS 17, 1931).
+    Args: sigma, px, the scale of Cauchy's loss: tracks' errors have long tails, and lean to one side there.
     """
-    usable = rows > 4
-    if not usable.any():
-        return NOISE_PX[1]
-    free = rows[usable] - 3
-    noise = median(np.sqrt(squares[usable] / free) / (1 - 2 / (9 * free)) ** 1.5)
-    return min(max(NOISE_PX[0], noise), NOISE_PX[1])
+    residual, by_point, by_rest = _linearised(rig, problem)
+    weight = robust_weights(residual, sigma, OUTLIER_SIGMAS * sigma if hard else np.inf) / sigma**2
+    sizes = point_noise(residual)
+    noise = float(np.clip(median(sizes), *NOISE_PX)) if len(sizes) else NOISE_PX[1]
+    return Eliminated.of(residual, by_point, by_rest, weight, len(SHARED_PRIOR)), noise
+
+
+def _linearised(rig: Rig, problem: _Problem) -> tuple[F64, F64, F64]:
+    """Residuals (N, 4 F), derivatives of the prediction by the point (N, 4 F, 3) and by the other unknowns (N, 4 F, R).
+
+    The other unknowns are the rig's terms, the lens's, and left perturbations of all moments' poses but the first's.
+    """
+    assert rig.right is not None
+    count, frames = problem.uv.shape[:2]
+    shared, rho = len(SHARED_PRIOR), problem.rho[:, None, None]
+    rotation, t = rig.left_T_right[:3, :3], rig.left_T_right[:3, 3]
+    by_direction = -rig.baseline * (rotation.T @ rectifying_rotations(rig.left_T_right)[0][1:].T)
+    turn, pos = problem.frame_T_first[:, :3, :3], problem.frame_T_first[:, :3, 3]
+    p = (turn @ problem.bearing[:, None, :, None])[..., 0] + rho * pos  # (N, F, 3), scaled by rho
+    q = (p - rho * t) @ rotation
+    by_rho = np.broadcast_to(pos[..., None], (count, frames, 3, 1))
+    p_point = np.concatenate([turn @ tangents(problem.bearing)[:, None], by_rho], -1)
+    q_point = rotation.T @ np.concatenate([p_point[..., :2], p_point[..., 2:] - t[:, None]], -1)
+    uv_left, left = rig.left.project_jacobian(p)
+    uv_right, right = rig.right.project_jacobian(q)
+    uv, by_point = np.stack([uv_left, uv_right], 2), np.stack([left @ p_point, right @ q_point], 2)
+    by_rest = np.zeros((count, frames, 2, 2, shared + 6 * (frames - 1)))
+    by_rest[..., RIG_TERMS:shared] = problem.shapes
+    of_right = by_rest[:, :, 1]
+    of_right[..., :3] = right @ se3.skew(q)
+    of_right[..., 3:5] = rho[..., None] * (right @ by_direction)
+    of_right[..., 5] = uv_right - rig.right.params[2:4]
+    if rig.left.model_id == PINHOLE and rig.right.model_id <= RADTAN:  # a calibrated distortion has its decentering
+        a, b = q[..., 0] / q[..., 2], q[..., 1] / q[..., 2]
+        shifted = np.stack([np.stack([-b * b, -a * b], -1), np.stack([a * b, a * a], -1)], -2)
+        of_right[..., 6:8] = rig.right.params[:2, None] * shifted
+    by_pose = np.concatenate([rho[..., None] * np.broadcast_to(np.eye(3), (*p.shape, 3)), -se3.skew(p)], -1)
+    both = np.stack([left @ by_pose, right @ rotation.T @ by_pose], 2)
+    for f in range(1, frames):
+        by_rest[:, f, :, :, shared + 6 * (f - 1) : shared + 6 * f] = both[:, f]
+    residual = problem.uv - uv - problem.shapes @ problem.lens
+    missing: Bool = np.isnan(residual[..., 0]) | np.isnan(residual[..., 1])
+    missing[..., 1] |= missing[..., 0]
+    residual[missing], by_point[missing], by_rest[missing] = np.nan, 0.0, 0.0
+    return residual.reshape(count, -1), by_point.reshape(count, -1, 3), by_rest.reshape(count, 4 * frames, -1)
+
+
+def _information(system: Eliminated, terms: F64, lens: F64) -> RigInformation:
+    """About the rig's terms alone, whatever the lens is."""
+    own = system.matrix[RIG_TERMS:, RIG_TERMS:] + np.diag(LENS_PRIOR**-2)
+    gain = np.linalg.solve(own, system.matrix[RIG_TERMS:, :RIG_TERMS]).T
+    matrix = system.matrix[:RIG_TERMS, :RIG_TERMS] - gain @ system.matrix[RIG_TERMS:, :RIG_TERMS]
+    gradient = system.gradient[:RIG_TERMS] - gain @ (system.gradient[RIG_TERMS:] + lens / LENS_PRIOR**2)
+    return RigInformation(matrix, matrix @ terms - gradient)
