@@ -42,8 +42,8 @@ def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
     table, points, pose = map_.observations, map_.points, map_.keyframes.map_T_kf
     out = np.empty((len(rows), 2))
     map_kernels.judge_points(
-        rows, map_.lists, table.uv_left, table.uv_right, table.sigma, pose[:, :3, :3], pose[:, :3, 3], points.xyz,
-        rig.left.model_id, rig.left.params, rig.baseline, out,
+        rows, points.head, table.following, table.kf, table.uv_left, table.uv_right, table.sigma,
+        pose[:, :3, :3], pose[:, :3, 3], points.xyz, rig.left.model_id, rig.left.params, rig.baseline, out,
     )  # fmt: skip
     return out[:, 0], out[:, 1]
 
@@ -125,11 +125,8 @@ def loose_keyframes(map_: Map, old_enough: Bool, repeated: I64, config: MapperCo
 
 def _seen_by_others(map_: Map, rows: I64) -> F64:
     """(N,) share of each keyframe's points that enough other keyframes see."""
-    shares, keyframes = np.empty(len(rows)), map_.keyframes
-    map_kernels.seen_shares(
-        rows, keyframes.obs_first, keyframes.obs_count, map_.observations.pt, map_.points.obs_count, OTHERS, shares
-    )
-    return shares
+    counts = [map_.points.obs_count[map_.seen_by(row)] for row in rows.tolist()]
+    return np.array([np.count_nonzero(seen > OTHERS) / max(len(seen), 1) for seen in counts])
 
 
 def _same_view(map_: Map, newest: int, rows: I64) -> Bool:

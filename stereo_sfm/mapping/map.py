@@ -88,42 +88,41 @@ class Map:
         rows = np.arange(first, first + int(self.keyframes.obs_count[row]))
         return rows[self.observations.pt[rows] >= 0]
 
-    @property
-    def lists(self) -> map_kernels.Lists:
-        """The points' lists of observations, valid until a table grows."""
-        table = self.observations
-        return map_kernels.Lists(self.points.head, table.following, table.kf, table.pt)
-
     def seen_by(self, row: int) -> I64:
         """Rows of the points that a keyframe observes."""
         return self.observations.pt[self.observations_of_keyframe(row)].astype(np.int64)
 
     def points_of_keyframes(self, rows: I64) -> I64:
         """Rows of the points that any of the keyframes observes, ascending."""
-        seen, keyframes = np.zeros(len(self.points), np.bool_), self.keyframes
-        rows = np.ascontiguousarray(rows, np.int64)
-        map_kernels.mark_seen(rows, keyframes.obs_first, keyframes.obs_count, self.observations.pt, seen)
+        seen = np.zeros(len(self.points), np.bool_)
+        for row in rows.tolist():
+            seen[self.seen_by(row)] = True
         return np.flatnonzero(seen)
 
     def count_by_keyframe(self, points: I64) -> I64:
         """(K,) number of the points that each keyframe observes."""
-        counts = np.zeros(len(self.keyframes), np.int64)
-        map_kernels.count_by_keyframe(np.ascontiguousarray(points, np.int64), self.lists, counts)
-        return counts
+        rows, _ = self.sightings(points)
+        return np.bincount(self.observations.kf[rows], minlength=len(self.keyframes))
 
     def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
         """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, then oldest first."""
-        keyframes = self.keyframes
-        rows, counts = map_kernels.shared(row, at_least, keyframes.obs_first, keyframes.obs_count, self.lists)
-        order = np.argsort(rows - counts * len(keyframes))
-        return rows[order], counts[order]
+        counts = self.count_by_keyframe(self.seen_by(row))
+        counts[row] = 0
+        rows = np.flatnonzero(counts >= max(at_least, 1))
+        rows = rows[np.argsort(-counts[rows], kind="stable")]
+        return rows, counts[rows]
+
+    def sightings(self, points: I64) -> tuple[I64, I64]:
+        """Rows of all observations of points (P,), point after point, newest first, and which of the points each is."""
+        points = np.ascontiguousarray(points, np.int64)
+        counts = self.points.obs_count[points]
+        rows = np.empty(int(counts.sum()), np.int64)
+        map_kernels.list_observations(points, self.points.head, self.observations.following, rows)
+        return rows, np.repeat(np.arange(len(points)), counts)
 
     def observations_of_points(self, rows: I64) -> I64:
         """Rows of all observations of some points, ascending."""
-        rows = np.ascontiguousarray(rows, np.int64)
-        out = np.empty(int(self.points.obs_count[rows].sum()), np.int64)
-        map_kernels.list_observations(rows, self.lists, out)
-        return np.sort(out)
+        return np.sort(self.sightings(rows)[0])
 
     def descriptors_of(self, rows: I64) -> U8:
         """(N, 32) descriptor of each point, zero where it has none."""
@@ -152,7 +151,7 @@ class Map:
             previous=row - 1 if same else -1,
             down=keyframe.down,
             down_sigma=keyframe.down_sigma,
-            **_inertial_state(keyframe),
+            state=0.0 if keyframe.inertial is None else np.delete(keyframe.inertial.state, np.s_[3:6]),  # no gravity
             obs_first=len(self.observations),
         )
         self._kf_rows[keyframe.kf_id] = row
@@ -191,12 +190,11 @@ class Map:
             sigma=self.points.sigma[pt_rows],
             descriptor=descriptors,
         )
-        map_kernels.link(rows.start, self.lists)
+        made = self._link(rows)
         self.keyframes.obs_count[kf] += len(pt_rows)
         self.points.obs_count[pt_rows] += 1
         self.points.seen[pt_rows] += 1
         self.points.last_seen[pt_rows] = np.maximum(self.points.last_seen[pt_rows], kf)
-        made = np.arange(rows.start, rows.stop)
         described = descriptors.any(axis=1)
         self.points.descriptor_obs[pt_rows[described]] = made[described]
         return made
@@ -206,11 +204,26 @@ class Map:
         table, rows = self.observations, self.observations_of_keyframe(kf)
         columns = {name: getattr(table, name)[rows] for name in table.spec if name != "following"}
         standing = self.points.descriptor_obs[columns["pt"]] == rows
-        map_kernels.unlink(rows, self.lists)
-        made = table.append(len(rows), **columns)
-        map_kernels.link(made.start, self.lists)
-        self.points.descriptor_obs[columns["pt"][standing]] = np.arange(made.start, made.stop)[standing]
-        self.keyframes.obs_first[kf], self.keyframes.obs_count[kf] = made.start, len(rows)
+        self._unlink(rows)
+        made = self._link(table.append(len(rows), **columns))
+        self.points.descriptor_obs[columns["pt"][standing]] = made[standing]
+        self.keyframes.obs_first[kf], self.keyframes.obs_count[kf] = len(table) - len(rows), len(rows)
+
+    def _link(self, made: slice) -> I64:
+        """Put new observations, of different points, at the heads of their points' lists. Returns their rows."""
+        rows, points = np.arange(made.start, made.stop), self.observations.pt[made]
+        self.observations.following[rows], self.points.head[points] = self.points.head[points], rows
+        return rows
+
+    def _unlink(self, rows: I64) -> None:
+        """Take observations out of their points' lists; the points' counts stay."""
+        table, points = self.observations, np.unique(self.observations.pt[rows])
+        obs, of = self.sightings(points)
+        table.pt[rows] = -1
+        obs, of = obs[stay := table.pt[obs] >= 0], of[stay]
+        table.following[obs] = np.where(of == np.append(of[1:], -1), np.append(obs[1:], -1), -1)
+        self.points.head[points] = -1
+        self.points.head[points[of[::-1]]] = obs[::-1]  # the first of each point is written last
 
     # -- changing ----------------------------------------------------------------------------------------------------
 
@@ -255,9 +268,14 @@ class Map:
         if not len(rows):
             return
         points = table.pt[rows].astype(np.int64)
-        map_kernels.unlink(rows, self.lists)
+        self._unlink(rows)
         np.subtract.at(self.points.obs_count, points, 1)
-        map_kernels.renew_standing(np.unique(points), self.lists, table.descriptor, self.points.descriptor_obs)
+        points, standing = np.unique(points), self.points.descriptor_obs
+        lost = points[(standing[points] >= 0) & (table.pt[standing[points]] != points)]
+        standing[lost] = -1
+        obs, of = self.sightings(lost)
+        described = table.descriptor[obs].any(axis=1)
+        np.maximum.at(standing, lost[of[described]], obs[described].astype(np.int32))
 
     def cull_points(self, rows: I64) -> None:
         """Cull points with all their observations."""
@@ -280,8 +298,9 @@ class Map:
         del self.corners[row]
         self._join_motions(row)
         self.keyframes.previous[self.keyframes.previous == row] = self.keyframes.previous[row]
-        orphans = points[self.points.anchor[points] == row]
-        map_kernels.anchor_anew(orphans, self.lists, self.points.anchor)
+        obs, of = self.sightings(orphans := points[self.points.anchor[points] == row])
+        self.points.anchor[orphans[of]] = len(self.keyframes)
+        np.minimum.at(self.points.anchor, orphans[of], self.observations.kf[obs])
 
     def _join_motions(self, row: int) -> None:
         """The motions to a keyframe and from it become one."""
@@ -312,11 +331,12 @@ class Map:
         pixels.
         """
         points, table = self.points, self.observations
-        double = np.empty(int(points.obs_count[old]), np.int64)
-        if count := map_kernels.seen_together(old, new, self.lists, double):
-            self.remove_observations(double[:count])
-        table.sigma[self.observations_of_points(np.array([old]))] = sigma
-        points.obs_count[new] += map_kernels.hand_over(old, new, self.lists)
+        self.remove_observations(self._seen_with(old, new))
+        handed, _ = self.sightings(np.array([old]))
+        table.sigma[handed], table.pt[handed] = sigma, new
+        if len(handed):
+            table.following[handed[-1]], points.head[new] = points.head[new], handed[0]
+        points.obs_count[new] += len(handed)
         points.sigma[new] = sigma
         points.seen[new] += points.seen[old]
         points.expected[new] += points.expected[old]
@@ -328,8 +348,12 @@ class Map:
 
     def share_a_keyframe(self, first: int, second: int) -> bool:
         """Whether one keyframe saw the points of both rows."""
-        both = np.empty(int(self.points.obs_count[first]), np.int64)
-        return map_kernels.seen_together(first, second, self.lists, both) > 0
+        return len(self._seen_with(first, second)) > 0
+
+    def _seen_with(self, point: int, other: int) -> I64:
+        """Rows of the observations of one point by keyframes that see the other, too."""
+        obs, others = (self.observations_of_points(np.array([p])) for p in (point, other))
+        return obs[np.isin(self.observations.kf[obs], self.observations.kf[others])]
 
     # -- memory ------------------------------------------------------------------------------------------------------
 
@@ -478,11 +502,3 @@ class Map:
         sensors = sum(motion.nbytes for motion in self.motions.values())
         sensors += sum(array.nbytes for state in self.known_states.values() for array in state)
         return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners + sensors
-
-
-def _inertial_state(keyframe: Keyframe) -> dict[str, F64]:
-    """The columns of velocity and biases."""
-    if keyframe.inertial is None:
-        return {}
-    velocity, _, accel_bias, gyro_bias = keyframe.inertial.state.reshape(4, 3)
-    return {"velocity": velocity, "accel_bias": accel_bias, "gyro_bias": gyro_bias}

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,148 +12,22 @@ from stereo_sfm.geometry.hamming import BITS, hamming
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.geometry.se3_kernels import transform_point
-from stereo_sfm.types import I32
-
-
-class Lists(NamedTuple):
-    """The observations of each point as a linked list."""
-
-    head: I32  # (P,) newest observation, -1: none
-    following: I32  # (M,) next older one of the same point, -1: last
-    kf: I32  # (M,) keyframe
-    pt: I32  # (M,) point, -1: removed
 
 
 @njit
-def link(first, lists):
-    """Puts the observations from row `first` on at the head of their points' lists."""
-    for o in range(first, lists.pt.shape[0]):
-        p = lists.pt[o]
-        lists.following[o] = lists.head[p]
-        lists.head[p] = o
+def list_observations(points, head, following, out):
+    """Fills out with the observations of points, point after point, newest first.
 
-
-@njit
-def list_observations(points, lists, out):
-    """Fills out with the observations of points, point after point, newest first."""
-    n = 0
-    for i in range(points.shape[0]):
-        o = lists.head[points[i]]
-        while o >= 0:
-            out[n] = o
-            n += 1
-            o = lists.following[o]
-
-
-@njit
-def renew_standing(points, lists, descriptor, standing):
-    """For points whose `standing` observation (P,) is another point's or removed: the newest that has a descriptor."""
-    for p in points:
-        if standing[p] < 0 or lists.pt[standing[p]] == p:
-            continue
-        standing[p] = -1
-        o = lists.head[p]
-        while o >= 0:
-            if o > standing[p] and descriptor[o].any():
-                standing[p] = o
-            o = lists.following[o]
-
-
-@njit
-def count_by_keyframe(points, lists, counts):
-    """Adds to counts (K,) how many of these points every keyframe sees."""
-    for i in range(points.shape[0]):
-        o = lists.head[points[i]]
-        while o >= 0:
-            counts[lists.kf[o]] += 1
-            o = lists.following[o]
-
-
-@njit
-def shared(row, at_least, first, count, lists):
-    """(N,) keyframes that share so many points with keyframe `row`, unordered, and (N,) the number of points."""
-    counts, found = np.zeros(first.shape[0], np.int64), np.empty(first.shape[0], np.int64)
-    n = 0
-    for o in range(first[row], first[row] + count[row]):
-        q = lists.head[lists.pt[o]] if lists.pt[o] >= 0 else -1
-        while q >= 0:
-            k = lists.kf[q]
-            if k != row:
-                if counts[k] == 0:
-                    found[n] = k
-                    n += 1
-                counts[k] += 1
-            q = lists.following[q]
-    kept = 0
-    for i in range(n):
-        if counts[found[i]] >= at_least:
-            found[kept] = found[i]
-            kept += 1
-    return found[:kept], counts[found[:kept]]
-
-
-@njit
-def list_sightings(points, lists, kf_index, obs, pt):
-    """Fills obs and pt with the observations of points by the keyframes whose kf_index is not negative.
-
-    Point after point, newest first; pt is the index into points. Returns how many there are.
+    Args:
+        head: (P,) newest observation of every point, -1: none. following: (M,) next older one of the same point.
     """
     n = 0
     for i in range(points.shape[0]):
-        o = lists.head[points[i]]
+        o = head[points[i]]
         while o >= 0:
-            if kf_index[lists.kf[o]] >= 0:
-                obs[n], pt[n] = o, i
-                n += 1
-            o = lists.following[o]
-    return n
-
-
-@njit
-def unlink(rows, lists):
-    """Takes observations out of their points' lists."""
-    for i in range(rows.shape[0]):
-        row = rows[i]
-        p = lists.pt[row]
-        before, o = -1, lists.head[p]
-        while o != row:
-            before, o = o, lists.following[o]
-        if before < 0:
-            lists.head[p] = lists.following[row]
-        else:
-            lists.following[before] = lists.following[row]
-        lists.pt[row] = -1
-
-
-@njit
-def seen_together(old, new, lists, out):
-    """Fills out with the observations of point `old` by keyframes that see `new` too. Returns how many there are."""
-    n = 0
-    o = lists.head[old]
-    while o >= 0:
-        q = lists.head[new]
-        while q >= 0 and lists.kf[q] != lists.kf[o]:
-            q = lists.following[q]
-        if q >= 0:
             out[n] = o
             n += 1
-        o = lists.following[o]
-    return n
-
-
-@njit
-def hand_over(old, new, lists):
-    """Moves the observations of point `old` to the front of the list of `new`. Returns how many there are."""
-    moved = 0
-    front, o = lists.head[new], lists.head[old]
-    last = -1
-    while o >= 0:
-        lists.pt[o] = new
-        moved += 1
-        last, o = o, lists.following[o]
-    if last >= 0:
-        lists.following[last], lists.head[new] = front, lists.head[old]
-    return moved
+            o = following[o]
 
 
 @njit
@@ -168,42 +41,7 @@ def follow(rows, fused_into):
 
 
 @njit
-def anchor_anew(points, lists, anchor):
-    """Anchors of points: the oldest keyframe that observes them, if any."""
-    for i in range(points.shape[0]):
-        o = lists.head[points[i]]
-        oldest = lists.kf[o] if o >= 0 else anchor[points[i]]
-        while o >= 0:
-            oldest = min(oldest, lists.kf[o])
-            o = lists.following[o]
-        anchor[points[i]] = oldest
-
-
-@njit
-def seen_shares(rows, first, count, obs_pt, pt_obs_count, others, out):
-    """Fills out with the share of each keyframe's points that more than `others` keyframes see; 0 without points."""
-    for i in range(rows.shape[0]):
-        k = rows[i]
-        points = seen = 0
-        for o in range(first[k], first[k] + count[k]):
-            if obs_pt[o] >= 0:
-                points += 1
-                seen += pt_obs_count[obs_pt[o]] > others
-        out[i] = seen / points if points else 0.0
-
-
-@njit
-def mark_seen(rows, first, count, obs_pt, marked):
-    """Sets marked (P,) at the points that these keyframes see."""
-    for i in range(rows.shape[0]):
-        k = rows[i]
-        for o in range(first[k], first[k] + count[k]):
-            if obs_pt[o] >= 0:
-                marked[obs_pt[o]] = True
-
-
-@njit
-def judge_points(points, lists, uv_left, uv_right, sigma, rot, pos, xyz, cam, params, base, out):
+def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot, pos, xyz, cam, params, base, out):
     """Fills out (N, 2): root mean squared error of the left images in sigmas, largest angle of a ray to the oldest's.
 
     Args:
@@ -212,23 +50,23 @@ def judge_points(points, lists, uv_left, uv_right, sigma, rot, pos, xyz, cam, pa
     """
     for i in range(points.shape[0]):
         p = points[i]
-        oldest = o = lists.head[p]
+        oldest = o = head[p]
         while o >= 0:
             oldest = min(oldest, o)
-            o = lists.following[o]
+            o = following[o]
         squared, chord, widest, n = 0.0, 0.0, 0.0, 0
         f0 = f1 = f2 = 0.0
         o = oldest
         first = True
         while o >= 0:
-            k = lists.kf[o]
+            k = obs_kf[o]
             d0, d1, d2 = xyz[p, 0] - pos[k, 0], xyz[p, 1] - pos[k, 1], xyz[p, 2] - pos[k, 2]
             distance = max(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-9)
             u0, u1, u2 = d0 / distance, d1 / distance, d2 / distance
             if first:  # the oldest ray, before the list is traversed from its head
                 f0, f1, f2 = u0, u1, u2
                 first = False
-                o = lists.head[p]
+                o = head[p]
                 continue
             x = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
             y = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
@@ -240,7 +78,7 @@ def judge_points(points, lists, uv_left, uv_right, sigma, rot, pos, xyz, cam, pa
             if math.isfinite(uv_right[o, 0]):
                 widest = max(widest, base / distance)
             n += 1
-            o = lists.following[o]
+            o = following[o]
         out[i, 0] = math.sqrt(squared / max(n, 1))
         out[i, 1] = max(2.0 * math.asin(min(math.sqrt(chord) / 2.0, 1.0)), widest)
 

@@ -115,9 +115,8 @@ def _inertial_factors(
     known = [map_.known_states.get(row) for row in nodes[first].tolist()]
     if not len(links) or all(state is None for state in known):
         return None
-    table = map_.keyframes
-    states = np.hstack([table.velocity[nodes], table.accel_bias[nodes], table.gyro_bias[nodes]])
-    return InertialFactors(imu, links, [m for m in motions if m is not None], first, known, states)
+    motions = [m for m in motions if m is not None]
+    return InertialFactors(imu, links, motions, first, known, map_.keyframes.state[nodes])
 
 
 @dataclass(eq=False)

@@ -23,9 +23,7 @@ class KeyframeTable(Columns):
     reference_T_kf: F64 = column(np.float64, np.eye(4), (4, 4))  # (K, 4, 4)
     down: F64 = column(np.float64, 0.0, (3,))  # (K, 3) gravity's direction in the camera, zero: unknown
     down_sigma: F64 = column(np.float64, 0.0)  # radians, 0: unknown
-    velocity: F64 = column(np.float64, 0.0, (3,))  # (K, 3) m/s in the IMU's axes
-    accel_bias: F64 = column(np.float64, 0.0, (3,))  # (K, 3) m/s^2
-    gyro_bias: F64 = column(np.float64, 0.0, (3,))  # (K, 3) rad/s
+    state: F64 = column(np.float64, 0.0, (9,))  # (K, 9) m/s in the IMU's axes, biases: m/s^2 and rad/s
     alive: Bool = column(np.bool_, True)
     named: Bool = column(np.bool_, True)  # whether loops may still name it
 

@@ -13,7 +13,6 @@ import numpy as np
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.level import level_of
 from stereo_sfm.mapping.map import POSE_POINTS, Map
@@ -94,8 +93,8 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     table, points = map_.observations, map_.points
     pts = map_.points_of_keyframes(moving)
     pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
-    counts = map_.count_by_keyframe(pts)
-    room = int(counts.sum())
+    obs, obs_pt = map_.sightings(pts)
+    counts = np.bincount(table.kf[obs], minlength=len(map_.keyframes))
     counts[moving] = 0
     seeing = np.flatnonzero(counts)
     held = np.sort(seeing[np.argsort(-counts[seeing], kind="stable")][:most_fixed])
@@ -104,9 +103,8 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     fixed |= kfs == 0
     kf_index = np.full(len(map_.keyframes), -1, np.int64)
     kf_index[kfs] = np.arange(len(kfs))
-    obs, obs_pt = np.empty(room, np.int64), np.empty(room, np.int64)
-    total = map_kernels.list_sightings(pts, map_.lists, kf_index, obs, obs_pt)
-    obs, obs_pt = obs[:total], obs_pt[:total]
+    inside = kf_index[table.kf[obs]] >= 0
+    obs, obs_pt = obs[inside], obs_pt[inside]
     fixed[_floating(map_, kfs, fixed)] = True
     bundle = Bundle(
         map_.keyframes.map_T_kf[kfs],
@@ -152,8 +150,7 @@ def write_back(map_: Map, part: Window, result: BundleResult) -> None:
     if part.bundle.motions is not None and result.states is not None:
         inside = part.bundle.motions.rows
         own = np.flatnonzero((inside >= 0) & ~part.bundle.fixed[inside])
-        rows, table = part.kf_rows[inside[own]], map_.keyframes
-        table.velocity[rows], table.accel_bias[rows], table.gyro_bias[rows] = np.hsplit(result.states[own], 3)
+        map_.keyframes.state[part.kf_rows[inside[own]]] = result.states[own]
     sane = np.isfinite(result.points).all(axis=1) & map_.points.alive[part.pt_rows]
     map_.move_points(part.pt_rows[sane], result.points[sane])
     table, obs = map_.observations, part.obs_rows

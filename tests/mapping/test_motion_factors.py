@@ -321,7 +321,7 @@ def test_the_mapper_uses_what_the_keyframes_bring() -> None:
         ):
             assert sensors == (part.bundle.motions is not None)
         if sensors:
-            speed = mapper.map.keyframes.velocity[rows[-1]]
+            speed = mapper.map.keyframes.state[rows[-1], :3]
             at = float(mapper.map.keyframes.stamp_ns[rows[-1]]) * 1e-9
             np.testing.assert_allclose(speed, imu_pose(at)[:3, :3].T @ velocity(at), atol=0.02)
         off = np.asarray(se3.so3_log(turns[0][:, :3, :3].mT @ turns[1][:, :3, :3]))
