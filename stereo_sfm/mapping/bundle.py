@@ -153,7 +153,7 @@ class _Table:
 
     def sum_up(self, rot: F64, lin: Linear) -> tuple[F64, F64]:
         """(P, 6) and (P, 3): the quadratic models of the points, in world axes."""
-        h, g = np.empty((len(self.starts) - 1, 6)), np.empty((len(self.starts) - 1, 3))
+        h, g = np.zeros((len(self.starts) - 1, 6)), np.zeros((len(self.starts) - 1, 3))
         kernels.sum_up(self.starts, self.kf, rot, lin, h, g)
         return h, g
 

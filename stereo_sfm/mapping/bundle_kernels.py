@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into, transform_point
 from stereo_sfm.mapping.block_product import subtract_product
 from stereo_sfm.types import F64, I64
@@ -99,9 +99,8 @@ def linearize(rot, pos, points, rows, trust, use, limit, cameras, scale, redesce
     obs_kf, obs_pt, uv_left, uv_right, weights = rows
     a, g, p, chi2 = out
     t = cameras.right_T_left
-    r00, r01, r02, t0 = t[0, 0], t[0, 1], t[0, 2], t[0, 3]
-    r10, r11, r12, t1 = t[1, 0], t[1, 1], t[1, 2], t[1, 3]
-    r20, r21, r22, t2 = t[2, 0], t[2, 1], t[2, 2], t[2, 3]
+    r00, r01, r02, r10, r11, r12 = t[0, 0], t[0, 1], t[0, 2], t[1, 0], t[1, 1], t[1, 2]
+    r20, r21, r22 = t[2, 0], t[2, 1], t[2, 2]
     cost = 0.0
     for o in range(obs_kf.shape[0]):
         k, i = obs_kf[o], obs_pt[o]
@@ -113,9 +112,7 @@ def linearize(rot, pos, points, rows, trust, use, limit, cameras, scale, redesce
         x0, x1, x2, y0, y1, y2, ru, rv, chi_l = _project(
             cameras.model_l, cameras.params_l, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], weights[o, 0]
         )
-        q0 = r00 * p0 + r01 * p1 + r02 * p2 + t0
-        q1 = r10 * p0 + r11 * p1 + r12 * p2 + t1
-        q2 = r20 * p0 + r21 * p1 + r22 * p2 + t2
+        q0, q1, q2 = transform_point(t, p0, p1, p2)
         u0, u1, u2, v0, v1, v2, su, sv, chi_r = _project(
             cameras.model_r, cameras.params_r, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], weights[o, 1]
         )
@@ -185,50 +182,50 @@ def add_disparity_errors(rot, pos, points, rows, use, cameras, total, informatio
             information[i] += w
 
 
+@inlined
+def _times(a, o, x, y, z):
+    """The symmetric matrix o of a, upper triangles, times a vector."""
+    return (
+        a[o, 0] * x + a[o, 1] * y + a[o, 2] * z,
+        a[o, 1] * x + a[o, 3] * y + a[o, 4] * z,
+        a[o, 2] * x + a[o, 4] * y + a[o, 5] * z,
+    )
+
+
+@inlined
+def _by_pose(x, y, z, p0, p1, p2):
+    """G^T times a vector in the camera, of a point p there: skew(p)^T v = v x p."""
+    return -x, -y, -z, y * p2 - z * p1, z * p0 - x * p2, x * p1 - y * p0
+
+
+@inlined
+def _cross_block(a, p, r, o, k, w, n):
+    """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
+    for c in range(3):
+        x, y, z = _times(a, o, r[k, c, 0], r[k, c, 1], r[k, c, 2])
+        (
+            w[n, 6 * c], w[n, 6 * c + 1], w[n, 6 * c + 2], w[n, 6 * c + 3], w[n, 6 * c + 4], w[n, 6 * c + 5],
+        ) = _by_pose(x, y, z, p[o, 0], p[o, 1], p[o, 2])  # fmt: skip
+
+
 @njit
 def pose_blocks(obs_kf, free, lin, h, b):
     """Adds G^T A G and -G^T g of every observation of a free keyframe to h (F, 6, 6) and b (F, 6)."""
-    a_all, g_all, p_all, _ = lin
+    a, g, p, _ = lin
+    one, w = np.zeros((1, 3, 3)), np.zeros((1, 18))
+    one[0, 0, 0] = one[0, 1, 1] = one[0, 2, 2] = 1.0
     for o in range(obs_kf.shape[0]):
         c = free[obs_kf[o]]
         if c < 0:
             continue
-        a, g, p = a_all[o], g_all[o], p_all[o]
-        p0, p1, p2 = p[0], p[1], p[2]
-        hc, bc = h[c], b[c]
-        bc[0] += g[0]
-        bc[1] += g[1]
-        bc[2] += g[2]
-        bc[3] -= g[1] * p2 - g[2] * p1
-        bc[4] -= g[2] * p0 - g[0] * p2
-        bc[5] -= g[0] * p1 - g[1] * p0
-        # M = A skew(p): columns A (e_k x ...), skew(p) = [[0, -p2, p1], [p2, 0, -p0], [-p1, p0, 0]]
-        rows = ((a[0], a[1], a[2]), (a[1], a[3], a[4]), (a[2], a[4], a[5]))
-        m00, m01, m02 = _row_times_skew(rows[0], p0, p1, p2)
-        m10, m11, m12 = _row_times_skew(rows[1], p0, p1, p2)
-        m20, m21, m22 = _row_times_skew(rows[2], p0, p1, p2)
-        hc[0, 0] += a[0]
-        hc[1, 0] += a[1]
-        hc[1, 1] += a[3]
-        hc[2, 0] += a[2]
-        hc[2, 1] += a[4]
-        hc[2, 2] += a[5]
-        hc[3, 0] -= m00
-        hc[3, 1] -= m10
-        hc[3, 2] -= m20
-        hc[4, 0] -= m01
-        hc[4, 1] -= m11
-        hc[4, 2] -= m21
-        hc[5, 0] -= m02
-        hc[5, 1] -= m12
-        hc[5, 2] -= m22
-        # skew(p)^T M, lower triangle
-        hc[3, 3] += p2 * m10 - p1 * m20
-        hc[4, 3] += p0 * m20 - p2 * m00
-        hc[4, 4] += p0 * m21 - p2 * m01
-        hc[5, 3] += p1 * m00 - p0 * m10
-        hc[5, 4] += p1 * m01 - p0 * m11
-        hc[5, 5] += p1 * m02 - p0 * m12
+        p0, p1, p2 = p[o, 0], p[o, 1], p[o, 2]
+        pull = _by_pose(g[o, 0], g[o, 1], g[o, 2], p0, p1, p2)
+        _cross_block(a, p, one, o, 0, w, 0)  # G^T A
+        for i in range(6):
+            b[c, i] -= pull[i]
+            column = _by_pose(w[0, i], w[0, 6 + i], w[0, 12 + i], p0, p1, p2)
+            for j in range(i, 6):
+                h[c, j, i] += column[j]
     for c in range(h.shape[0]):
         for i in range(6):
             for k in range(i + 1, 6):
@@ -249,50 +246,20 @@ def move_poses(rows, xi, rot, pos):
             rot[k, r, 0], rot[k, r, 1], rot[k, r, 2], pos[k, r] = after[r, 0], after[r, 1], after[r, 2], after[r, 3]
 
 
-@inner
-def _row_times_skew(row, p0, p1, p2):
-    return row[1] * p2 - row[2] * p1, row[2] * p0 - row[0] * p2, row[0] * p1 - row[1] * p0
-
-
-@inlined
-def _world_model(a, r, o, k):
-    """R A R^T of observation o in keyframe k, upper triangle."""
-    a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
-    x0 = a0 * r[k, 0, 0] + a1 * r[k, 0, 1] + a2 * r[k, 0, 2]
-    x1 = a1 * r[k, 0, 0] + a3 * r[k, 0, 1] + a4 * r[k, 0, 2]
-    x2 = a2 * r[k, 0, 0] + a4 * r[k, 0, 1] + a5 * r[k, 0, 2]
-    y0 = a0 * r[k, 1, 0] + a1 * r[k, 1, 1] + a2 * r[k, 1, 2]
-    y1 = a1 * r[k, 1, 0] + a3 * r[k, 1, 1] + a4 * r[k, 1, 2]
-    y2 = a2 * r[k, 1, 0] + a4 * r[k, 1, 1] + a5 * r[k, 1, 2]
-    z0 = a0 * r[k, 2, 0] + a1 * r[k, 2, 1] + a2 * r[k, 2, 2]
-    z1 = a1 * r[k, 2, 0] + a3 * r[k, 2, 1] + a4 * r[k, 2, 2]
-    z2 = a2 * r[k, 2, 0] + a4 * r[k, 2, 1] + a5 * r[k, 2, 2]
-    return (
-        r[k, 0, 0] * x0 + r[k, 0, 1] * x1 + r[k, 0, 2] * x2,
-        r[k, 1, 0] * x0 + r[k, 1, 1] * x1 + r[k, 1, 2] * x2,
-        r[k, 2, 0] * x0 + r[k, 2, 1] * x1 + r[k, 2, 2] * x2,
-        r[k, 1, 0] * y0 + r[k, 1, 1] * y1 + r[k, 1, 2] * y2,
-        r[k, 2, 0] * y0 + r[k, 2, 1] * y1 + r[k, 2, 2] * y2,
-        r[k, 2, 0] * z0 + r[k, 2, 1] * z1 + r[k, 2, 2] * z2,
-    )
-
-
 @njit
 def sum_up(starts, obs_kf, rot, lin, h, g):
-    """The quadratic model of every point: h (P, 6) = sum of R A R^T, upper triangle, g (P, 3) = sum of R g."""
+    """Adds up the quadratic models of every point: R A R^T to h (P, 6), upper triangle, and R g to g (P, 3)."""
     a_all, g_all, _, _ = lin
     for pt in range(starts.shape[0] - 1):
-        h0 = h1 = h2 = h3 = h4 = h5 = g0 = g1 = g2 = 0.0
         for o in range(starts[pt], starts[pt + 1]):
-            k = obs_kf[o]
-            m0, m1, m2, m3, m4, m5 = _world_model(a_all, rot, o, k)
-            h0, h1, h2, h3, h4, h5 = h0 + m0, h1 + m1, h2 + m2, h3 + m3, h4 + m4, h5 + m5
-            x, y, z = g_all[o, 0], g_all[o, 1], g_all[o, 2]
-            g0 += rot[k, 0, 0] * x + rot[k, 0, 1] * y + rot[k, 0, 2] * z
-            g1 += rot[k, 1, 0] * x + rot[k, 1, 1] * y + rot[k, 1, 2] * z
-            g2 += rot[k, 2, 0] * x + rot[k, 2, 1] * y + rot[k, 2, 2] * z
-        h[pt, 0], h[pt, 1], h[pt, 2], h[pt, 3], h[pt, 4], h[pt, 5] = h0, h1, h2, h3, h4, h5
-        g[pt, 0], g[pt, 1], g[pt, 2] = g0, g1, g2
+            k, n = obs_kf[o], 0
+            for i in range(3):
+                r0, r1, r2 = rot[k, i, 0], rot[k, i, 1], rot[k, i, 2]
+                x, y, z = _times(a_all, o, r0, r1, r2)
+                for j in range(i, 3):
+                    h[pt, n] += rot[k, j, 0] * x + rot[k, j, 1] * y + rot[k, j, 2] * z
+                    n += 1
+                g[pt, i] += r0 * g_all[o, 0] + r1 * g_all[o, 1] + r2 * g_all[o, 2]
 
 
 @njit
@@ -301,24 +268,20 @@ def prior_cost(points, x0, h, g):
     cost = 0.0
     for i in range(points.shape[0]):
         d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]
-        e0 = h[i, 0] * d0 + h[i, 1] * d1 + h[i, 2] * d2
-        e1 = h[i, 1] * d0 + h[i, 3] * d1 + h[i, 4] * d2
-        e2 = h[i, 2] * d0 + h[i, 4] * d1 + h[i, 5] * d2
+        e0, e1, e2 = _times(h, i, d0, d1, d2)
         cost += (g[i, 0] + 0.5 * e0) * d0 + (g[i, 1] + 0.5 * e1) * d1 + (g[i, 2] + 0.5 * e2) * d2
     return cost
 
 
 @njit
-def point_blocks(points, x0, prior_h, prior_g, damping, h, g):
+def point_blocks(points, x0, q, prior_g, damping, h, g):
     """Turns the sums of the moving keyframes, h (P, 6) and g (P, 3), into (H_point + damping diag)^-1 and b_point.
 
-    Both are zero for a point whose block is singular: nothing sees it.
+    Both are zero for a point whose block is singular: nothing sees it. q, prior_g: the priors' H (P, 6) and g (P, 3).
     """
     for i in range(points.shape[0]):
         d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]
-        q0, q1, q2, q3, q4, q5 = (
-            prior_h[i, 0], prior_h[i, 1], prior_h[i, 2], prior_h[i, 3], prior_h[i, 4], prior_h[i, 5],
-        )  # fmt: skip
+        q0, q1, q2, q3, q4, q5 = q[i, 0], q[i, 1], q[i, 2], q[i, 3], q[i, 4], q[i, 5]
         g[i, 0] = -g[i, 0] - prior_g[i, 0] - q0 * d0 - q1 * d1 - q2 * d2
         g[i, 1] = -g[i, 1] - prior_g[i, 1] - q1 * d0 - q3 * d1 - q4 * d2
         g[i, 2] = -g[i, 2] - prior_g[i, 2] - q2 * d0 - q4 * d1 - q5 * d2
@@ -343,26 +306,9 @@ def point_blocks(points, x0, prior_h, prior_g, damping, h, g):
 
 
 @njit
-def count_pairs(starts, obs_kf, free):
-    """How many (free keyframe, free keyframe) pairs, the diagonal included, the points join, and most of one point."""
-    total = 0
-    most = 0
-    for pt in range(starts.shape[0] - 1):
-        n = 0
-        for o in range(starts[pt], starts[pt + 1]):
-            if free[obs_kf[o]] >= 0:
-                n += 1
-        total += n * (n + 1) // 2
-        most = max(most, n)
-    return total, most
-
-
-@njit
-def list_pairs(starts, obs_kf, free, keys):
-    """Fills keys with row * F + column (row >= column) of every pair in the order in which `reduce` visits them."""
-    n_free = 0
-    for k in range(free.shape[0]):
-        n_free = max(n_free, free[k] + 1)
+def list_pairs(starts, obs_kf, free, n_free, keys):
+    """Fills keys with row * F + column (row >= column) of every pair of free keyframes, the diagonal included, that a
+    point joins, in the order in which `reduce` visits them."""
     i = 0
     for pt in range(starts.shape[0] - 1):
         for o in range(starts[pt], starts[pt + 1]):
@@ -374,19 +320,6 @@ def list_pairs(starts, obs_kf, free, keys):
                 if d >= 0:
                     keys[i] = max(c, d) * n_free + min(c, d)
                     i += 1
-
-
-@inlined
-def _cross_block(a, p, r, o, k, w, n):
-    """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
-    a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
-    p0, p1, p2 = p[o, 0], p[o, 1], p[o, 2]
-    for c in range(3):
-        x, y, z = r[k, c, 0], r[k, c, 1], r[k, c, 2]
-        u, v, s = a0 * x + a1 * y + a2 * z, a1 * x + a3 * y + a4 * z, a2 * x + a4 * y + a5 * z
-        w[n, 6 * c], w[n, 6 * c + 1], w[n, 6 * c + 2] = -u, -v, -s
-        # skew(p)^T v = v x p = -p x v
-        w[n, 6 * c + 3], w[n, 6 * c + 4], w[n, 6 * c + 5] = v * p2 - s * p1, s * p0 - u * p2, u * p1 - v * p0
 
 
 @njit
@@ -412,15 +345,11 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
                 _cross_block(a_all, p_all, rot, o, obs_kf[o], w, n)
                 row[n] = c
                 n += 1
-        h0, h1, h2, h3, h4, h5 = (
-            h_inv[pt, 0], h_inv[pt, 1], h_inv[pt, 2], h_inv[pt, 3], h_inv[pt, 4], h_inv[pt, 5],
-        )  # fmt: skip
         b0, b1, b2 = b_point[pt, 0], b_point[pt, 1], b_point[pt, 2]
         for m in range(n):
             c = row[m]
             for k in range(6):
-                w0, w1, w2 = w[m, k], w[m, 6 + k], w[m, 12 + k]
-                y0, y1, y2 = w0 * h0 + w1 * h1 + w2 * h2, w0 * h1 + w1 * h3 + w2 * h4, w0 * h2 + w1 * h4 + w2 * h5
+                y0, y1, y2 = _times(h_inv, pt, w[m, k], w[m, 6 + k], w[m, 12 + k])
                 y[0, k], y[0, 6 + k], y[0, 12 + k] = y0, y1, y2
                 b[c, k] -= y0 * b0 + y1 * b1 + y2 * b2
             for q in range(m + 1):
@@ -432,8 +361,8 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
 
 
 @njit
-def point_steps(starts, obs_kf, free, rot, lin, h_inv, b_point, step, points, out):
-    """Back substitution: out = points + H_point^-1 (b_point - W^T step) with step (F, 6)."""
+def point_steps(starts, obs_kf, free, rot, lin, h, b_point, step, points, out):
+    """Back substitution: out = points + h (b_point - W^T step) with step (F, 6), h = H_point^-1."""
     a, _, p, _ = lin
     for pt in range(starts.shape[0] - 1):
         b0, b1, b2 = b_point[pt, 0], b_point[pt, 1], b_point[pt, 2]
@@ -445,15 +374,10 @@ def point_steps(starts, obs_kf, free, rot, lin, h_inv, b_point, step, points, ou
             v0 = p[o, 1] * step[c, 5] - p[o, 2] * step[c, 4] - step[c, 0]
             v1 = p[o, 2] * step[c, 3] - p[o, 0] * step[c, 5] - step[c, 1]
             v2 = p[o, 0] * step[c, 4] - p[o, 1] * step[c, 3] - step[c, 2]
-            u0 = a[o, 0] * v0 + a[o, 1] * v1 + a[o, 2] * v2
-            u1 = a[o, 1] * v0 + a[o, 3] * v1 + a[o, 4] * v2
-            u2 = a[o, 2] * v0 + a[o, 4] * v1 + a[o, 5] * v2
+            u0, u1, u2 = _times(a, o, v0, v1, v2)
             b0 -= rot[k, 0, 0] * u0 + rot[k, 0, 1] * u1 + rot[k, 0, 2] * u2
             b1 -= rot[k, 1, 0] * u0 + rot[k, 1, 1] * u1 + rot[k, 1, 2] * u2
             b2 -= rot[k, 2, 0] * u0 + rot[k, 2, 1] * u1 + rot[k, 2, 2] * u2
-        h0, h1, h2, h3, h4, h5 = (
-            h_inv[pt, 0], h_inv[pt, 1], h_inv[pt, 2], h_inv[pt, 3], h_inv[pt, 4], h_inv[pt, 5],
-        )  # fmt: skip
-        out[pt, 0] = points[pt, 0] + h0 * b0 + h1 * b1 + h2 * b2
-        out[pt, 1] = points[pt, 1] + h1 * b0 + h3 * b1 + h4 * b2
-        out[pt, 2] = points[pt, 2] + h2 * b0 + h4 * b1 + h5 * b2
+        out[pt, 0] = points[pt, 0] + h[pt, 0] * b0 + h[pt, 1] * b1 + h[pt, 2] * b2
+        out[pt, 1] = points[pt, 1] + h[pt, 1] * b0 + h[pt, 3] * b1 + h[pt, 4] * b2
+        out[pt, 2] = points[pt, 2] + h[pt, 2] * b0 + h[pt, 4] * b1 + h[pt, 5] * b2

@@ -33,9 +33,9 @@ class ReducedSystem:
         """
         self.size = n = int(free.max(initial=-1)) + 1
         self.dense = n <= DENSE_KEYFRAMES if dense is None else dense
-        pairs, self.most = bundle_kernels.count_pairs(starts, obs_kf, free)
-        keys = np.empty(pairs, np.int64)
-        bundle_kernels.list_pairs(starts, obs_kf, free, keys)
+        seen = np.diff(np.append(0, np.cumsum(free[obs_kf] >= 0))[starts])  # (P,) free keyframes of every point
+        self.most, keys = int(seen.max(initial=0)), np.empty(int((seen * (seen + 1) // 2).sum()), np.int64)
+        bundle_kernels.list_pairs(starts, obs_kf, free, n, keys)
         diagonal = np.arange(n, dtype=np.int64) * (n + 1)
         if self.dense:
             self.count, self._slots, self._diagonal = n * n, keys.astype(np.int32), diagonal
