@@ -60,11 +60,18 @@ def apply_loop(
     if not (map_.keyframes.alive[a] and map_.keyframes.alive[b]):
         return Correction(False, [])
     before = map_.keyframe_poses()
-    bent = _strain(before, loop_edges(map_, [loop])) > MAX_NOISE
+    odometry, closed = odometry_edges(map_, before), loop_edges(map_, [*earlier, loop])
+    bent = _strain(before, closed) > MAX_NOISE
+    part = _components(len(before), join([odometry, Edges(*(column[:-1] for column in vars(closed).values()))]))
+    apart, start = part[a] != part[b], before
+    if apart:  # a submap that this loop connects with the rest: move the newer part there as a rigid body first
+        move = before[a] @ loop.candidate_T_kf @ se3.inverse(before[b])
+        newer, move = (b, move) if part[b] > part[a] else (a, se3.inverse(move))
+        start = np.where((part == part[newer])[:, None, None], move @ before, before)
     if config.correction == "averaging":
-        after = _averaged(map_, before, loop, earlier)
+        after = start if apart else _averaged(map_, before, loop, a, b)
     elif config.correction == "pose_graph":
-        optimised = _optimised(map_, before, loop, earlier, config)
+        optimised = _optimised(map_, start, odometry, closed, (a, b), config)
         if optimised is None:
             return Correction(False, [])
         after = optimised
@@ -89,40 +96,25 @@ def sides_share_points(map_: Map, loop: LoopResult, connected_points: int) -> bo
 
 
 def fuse_sides(map_: Map, loop: LoopResult, match_sigma_px: float) -> list[tuple[int, int]]:
-    """Make one of what both sides of a loop see: its pairs of points, and its corners, which become points.
+    """Make one of what both sides of a loop see: its pairs of living points, and its corners, which become points.
 
     Returns:
-        Point rows (removed, kept).
-    """
-    fused = fuse_pairs(map_, loop.matches, match_sigma_px)
-    return fused + join_corners(map_, loop.sightings, match_sigma_px)
-
-
-def fuse_pairs(map_: Map, pairs: I64, match_sigma_px: float) -> list[tuple[int, int]]:
-    """Fuse each pair of ids (M, 2) that are two living points; the first of a pair is kept.
-
-    Returns:
-        Rows (removed, kept).
+        Point rows (removed, kept): of pairs the first is kept.
     """
     fused: list[tuple[int, int]] = []
-    for kept_id, removed_id in pairs.tolist():
+    for kept_id, removed_id in loop.matches.tolist():
         kept, removed = map_.point_rows(np.array([kept_id, removed_id]))
         if kept >= 0 and removed >= 0 and kept != removed and map_.points.alive[kept] and map_.points.alive[removed]:
             map_.fuse(int(removed), int(kept), match_sigma_px)
             fused.append((int(removed), int(kept)))
-    return fused
+    return fused + join_corners(map_, loop.sightings, match_sigma_px)
 
 
-def _averaged(map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult]) -> F64:
-    """The loop's error distributed over the path that led to it. Parts that the loop connects move as rigid bodies.
+def _averaged(map_: Map, before: F64, loop: LoopResult, a: int, b: int) -> F64:
+    """The error of a loop from row a to b distributed over the path that led to it.
 
     Between two submaps that are connected already, the path of the newer one from its first keyframe takes the error.
     """
-    a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    odometry, closed = odometry_edges(map_, before), loop_edges(map_, [*earlier, loop])
-    part = _parts(len(before), odometry, closed, len(closed) - 1)
-    if part[a] != part[b]:
-        return _connected(before, loop, a, b, part)
     if a > b:
         raise StereoSfmError("transformation averaging needs a loop back to an older keyframe")
     after, submap = before.copy(), map_.keyframes.submap_id
@@ -134,40 +126,31 @@ def _averaged(map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopRe
     return after
 
 
-def _connected(before: F64, loop: LoopResult, a: int, b: int, part: I64) -> F64:
-    """The poses with the newer of two unconnected parts moved as a rigid body to fit the loop."""
-    after = before.copy()
-    move = before[a] @ loop.candidate_T_kf @ se3.inverse(before[b])
-    rows = part == part[b] if part[b] > part[a] else part == part[a]
-    after[rows] = (move if part[b] > part[a] else se3.inverse(move)) @ before[rows]
-    return after
-
-
 def _optimised(
-    map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig
+    map_: Map, start: F64, odometry: Edges, closed: Edges, ends: tuple[int, int], config: LoopConfig
 ) -> F64 | None:
-    """Poses that agree with odometry and loops, or None if the loop contradicts them.
+    """Poses that agree with odometry and loops, or None if the last loop, between two rows, contradicts them.
 
     Odometry first has the accuracy of good tracking; if the loop is then strained, as much systematic drift is allowed
     as may accumulate along the path.
     """
-    a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    odometry = odometry_edges(map_, before)
-    closed = loop_edges(map_, [*earlier, loop])
-    part = _parts(len(before), odometry, closed, len(closed) - 1)
-    start = before
-    if part[a] != part[b]:  # a submap that this loop connects with the rest: move it there as a rigid body first
-        start = _connected(before, loop, a, b, part)
     edges = join([odometry, closed])
-    fixed, gravity = _first_of_each_part(len(before), edges), _gravity(map_, start, edges)
+    part, used = _components(len(start), edges), np.unique(np.concatenate([edges.i, edges.j]))
+    fixed = used[np.unique(part[used], return_index=True)[1]]  # the oldest of each part
+    gravity = _gravity(map_, start, used, part)
     result = optimise(start, edges, fixed, config.robust, gravity)
     strain = max(_strain(result.poses, closed), _tilt_strain(result.poses, gravity))
     if result.weights[-1] < 0.5 or strain > MAX_STRAIN:
-        edges = join([_with_drift(odometry, before, a, b), closed])
+        edges = join([_with_drift(odometry, start, *ends), closed])
         result = optimise(start, edges, fixed, config.robust, gravity)
     if result.weights[-1] < 0.5:
         return None
-    return result.poses if gravity is None else _as_before(result.poses, start, edges, fixed)
+    if gravity is None:
+        return result.poses
+    # Each part as a whole back to where its fixed row is: gravity may have tilted it.
+    move = np.tile(np.eye(4), (int(part.max()) + 1, 1, 1))
+    move[part[fixed]] = start[fixed] @ se3.inverse(result.poses[fixed])
+    return move[part] @ result.poses
 
 
 def _tilt_strain(poses: F64, gravity: Gravity | None) -> float:
@@ -178,25 +161,16 @@ def _tilt_strain(poses: F64, gravity: Gravity | None) -> float:
     return 3.0 * float(np.mean((off**2).sum(axis=1) / gravity.sigma**2) / 2)
 
 
-def _gravity(map_: Map, poses: F64, edges: Edges) -> Gravity | None:
-    """What the living keyframes of the graph measured of gravity: for each part of it one direction, their mean."""
+def _gravity(map_: Map, poses: F64, rows: I64, part: I64) -> Gravity | None:
+    """What the living keyframes of some rows measured of gravity: for each part (K,) one direction, their mean."""
     table = map_.keyframes
-    rows = np.unique(np.concatenate([edges.i, edges.j]))
     rows = rows[table.alive[rows] & (table.down_sigma[rows] > 0)]
     if not len(rows):
         return None
-    seen, sigma, part = table.down[rows], table.down_sigma[rows], _components(len(poses), edges.i, edges.j)[rows]
+    seen, sigma, part = table.down[rows], table.down_sigma[rows], part[rows]
     total = np.zeros((int(part.max()) + 1, 3))
     np.add.at(total, part, np.einsum("nij,nj->ni", poses[rows, :3, :3], seen) * weights(sigma)[:, None])
     return Gravity(rows, seen, sigma, (total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])[part])
-
-
-def _as_before(poses: F64, before: F64, edges: Edges, fixed: I64) -> F64:
-    """Each part of the graph moved as a whole, so that its fixed row is where it was: gravity may have tilted it."""
-    part = _components(len(poses), edges.i, edges.j)
-    move = np.tile(np.eye(4), (int(part.max()) + 1, 1, 1))
-    move[part[fixed]] = before[fixed] @ se3.inverse(poses[fixed])
-    return move[part] @ poses
 
 
 def _strain(poses: F64, closed: Edges) -> float:
@@ -259,20 +233,7 @@ def loop_sigmas(information: F64) -> tuple[float, float]:
     return max(float(metres), LOOP_SIGMAS[0]), max(float(radians), LOOP_SIGMAS[1])
 
 
-def _parts(count: int, odometry: Edges, closed: Edges, without: int) -> I64:
-    """(K,) connected component of each keyframe without the loop edge `without`."""
-    i = np.concatenate([odometry.i, np.delete(closed.i, without)])
-    j = np.concatenate([odometry.j, np.delete(closed.j, without)])
-    return _components(count, i, j)
-
-
-def _components(count: int, i: I64, j: I64) -> I64:
-    graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), shape=(count, count))
+def _components(count: int, edges: Edges) -> I64:
+    """(K,) connected component of each keyframe."""
+    graph = scipy.sparse.coo_array((np.ones(len(edges)), (edges.i, edges.j)), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
-
-
-def _first_of_each_part(count: int, edges: Edges) -> I64:
-    """The oldest row of each connected component, which is fixed."""
-    part = _components(count, edges.i, edges.j)
-    used = np.unique(np.concatenate([edges.i, edges.j]))
-    return used[np.unique(part[used], return_index=True)[1]]
