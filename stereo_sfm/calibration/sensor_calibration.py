@@ -98,7 +98,12 @@ class SensorCalibration:
         return self._compared(keyframe.kf_id, keyframe.stamp_ns, version)
 
     def _compared(self, kf_id: int, stamp_ns: int, version: int) -> SensorUpdate | None:
-        said = [*self._compared_imu(), *self._compared_wheel()]
+        said: list[Finding] = []
+        for compare in (self._compared_imu, self._compared_wheel):
+            try:
+                said += compare()
+            except StereoSfmError:  # too little motion
+                continue
         if not said:
             return None
         right = ", ".join(f.name for f in said if f.judged and not f.level)
@@ -114,10 +119,7 @@ class SensorCalibration:
         samples, imu = [p.imu for p in self._parts if p.imu is not None], self._rig.imu
         if imu is None or not samples:
             return []
-        try:
-            found = fit_imu(*self._seen(), ImuSamples.joined(samples), imu)
-        except StereoSfmError:  # too little motion
-            return []
+        found = fit_imu(*self._seen(), ImuSamples.joined(samples), imu)
         if found.agreement < AGREEMENT or abs(found.scale - 1) > WRONG_SCALE:
             return []
         turn_sigma = found.imu.left_T_imu[:3, :3].T @ np.diag(found.rotation_sigma**2) @ found.imu.left_T_imu[:3, :3]
@@ -129,13 +131,8 @@ class SensorCalibration:
         samples, wheel = [p.wheel for p in self._parts if p.wheel is not None], self._rig.wheel
         if wheel is None or not samples:
             return []
-        try:
-            found = fit_wheel(*self._seen(), WheelSamples.joined(samples), wheel)
-        except StereoSfmError:  # too little motion
-            return []
-        if found.agreement < AGREEMENT:
-            return []
-        if not self._wheel.take(found.value, found.sigma):
+        found = fit_wheel(*self._seen(), WheelSamples.joined(samples), wheel)
+        if found.agreement < AGREEMENT or not self._wheel.take(found.value, found.sigma):
             return []
         return [f for f in judge_wheel(found, wheel) if f.name != "wheels' time offset"]
 

@@ -39,7 +39,8 @@ def insert_keyframe(
     rows[new] = map_.add_points(keyframe.point_ids[new], xyz, row, config.sigma_px)
     fused = [pair for i, known in matches.tolist() if (pair := fuse_points(map_, int(rows[i]), known, config))]
     rows = map_.point_rows(keyframe.point_ids)
-    keep = _first_of_each(np.where(usable, rows, -1))
+    each, first = np.unique(np.where(usable, rows, -1), return_index=True)
+    keep = np.sort(first[each >= 0])  # one observation of a point
     map_.observe(row, rows[keep], keyframe.uv_left[keep], keyframe.uv_right[keep], keyframe.descriptors[keep])
     return row, fused
 
@@ -82,9 +83,3 @@ def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tup
         return None
     map_.fuse(removed, kept, config.match_sigma_px)
     return removed, kept
-
-
-def _first_of_each(rows: I64) -> I64:
-    """Indices of the first occurrence of every row that is not negative, ascending."""
-    values, first = np.unique(rows, return_index=True)
-    return np.sort(first[values >= 0])

@@ -61,7 +61,6 @@ from stereo_sfm.types import (
     F64,
     I64,
     RIG_TERMS,
-    Bool,
     CalibrationUpdate,
     Keyframe,
     LoopResult,
@@ -145,9 +144,12 @@ class Mapper(AnyMapper):
             keyframe: the newest. loop: the loop closer's result for an earlier keyframe, or none.
         """
         self._version += 1
-        self._calibrate_sensors(keyframe)
+        if self._sensors is not None:
+            with self._spans.span("calibrate_sensors"):
+                self._sensor_update = self._sensors.add(keyframe, self._version)
         if not self._config.enabled:
-            return self._without_mapping(keyframe)
+            ids, poses = np.array([keyframe.kf_id]), np.array([keyframe.odom_T_cam])
+            return MapUpdate(self._version, keyframe.kf_id, ids, poses, sensors=self._sensor_update)
         if self._job is None and self.map.many_forgotten:
             now = self.map.free_keyframes()
             self._repeated = [row for row in now[self._repeated].tolist() if row >= 0]
@@ -200,12 +202,9 @@ class Mapper(AnyMapper):
             self._apply_job()
         return self._update(int(self.map.keyframes.kf_id[-1]))
 
-    def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
-        kf_id, pose = keyframe.kf_id, keyframe.odom_T_cam
-        return MapUpdate(self._version, kf_id, np.array([kf_id]), np.array([pose]), sensors=self._sensor_update)
-
     def _update(self, kf_id: int) -> MapUpdate:
-        delta = self.map.take_delta()
+        delta, table = self.map.take_delta(), self.map.keyframes
+        of_first_submap = np.flatnonzero(table.alive & (table.submap_id == table.submap_id[0]))
         culled = self.map.points.pt_id[np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))]
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
         refused = np.array(self._refused, np.int64)
@@ -215,35 +214,24 @@ class Mapper(AnyMapper):
         return MapUpdate(
             version=self._version,
             kf_id=kf_id,
-            kf_ids=self.map.keyframes.kf_id[delta.kf_rows],
+            kf_ids=table.kf_id[delta.kf_rows],
             map_T_kf=delta.map_T_kf,
             point_ids=self.map.points.pt_id[delta.pt_rows],
             points_map=delta.xyz,
             culled_point_ids=culled[culled >= 0],
             fused_point_ids=fused[(fused >= 0).all(axis=1)],
             map_T_odom=self._map_T_odom.copy(),
-            culled_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 0]],
-            carrier_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 1]],
+            culled_kf_ids=table.kf_id[delta.culled_kf[:, 0]],
+            carrier_kf_ids=table.kf_id[delta.culled_kf[:, 1]],
             carrier_T_kf=delta.reference_T_kf,
             refused_kf_ids=refused,
             calibration=revised,
             row_errors=row_errors,
             sensors=self._sensor_update,
-            down=down_of(self.map, self._of_first_submap()),
+            down=down_of(self.map, of_first_submap),  # whose frame is the map's
         )
 
-    def _of_first_submap(self) -> I64:
-        """Rows of the living keyframes of the submap that the map's frame belongs to."""
-        table = self.map.keyframes
-        return np.flatnonzero(table.alive & (table.submap_id == table.submap_id[0]))
-
     # -- calibration -------------------------------------------------------------------------------------------------
-
-    def _calibrate_sensors(self, keyframe: Keyframe) -> None:
-        """Compare IMU and wheels with the poses by the images, where that is asked for."""
-        if self._sensors is not None:
-            with self._spans.span("calibrate_sensors"):
-                self._sensor_update = self._sensors.add(keyframe, self._version)
 
     def _revise(self, revision: Revision | None) -> None:
         """Correct the rig: points move to their positions with the new rig, and a full bundle adjustment follows."""
@@ -409,7 +397,8 @@ class Mapper(AnyMapper):
     def _cull(self, row: int) -> None:
         recent = range(max(0, row - RECENT), row + 1)
         seen = [self.map.seen_by(k) for k in recent]
-        protected = self._protected()
+        protected = np.zeros(len(self.map.keyframes), bool)
+        protected[0] = protected[-RECENT:] = True
         earlier = culling.earlier_visits(self.map, row, protected)
         redundant = culling.redundant_keyframe(self.map, row, protected, earlier, self._config)
         if len(earlier):
@@ -456,13 +445,6 @@ class Mapper(AnyMapper):
         submaps = [frozenset(int(table.submap_id[self.map.kf_row(k)]) for k in _ends(x)) for x in self._loops]
         own = [s for s, x in zip(submaps, self._loops, strict=True) if len(s) == 2 and kf_id in _ends(x)]
         return any(submaps.count(s) == 1 for s in own)
-
-    def _protected(self) -> Bool:
-        """(K,) keyframes that must stay: the first and the newest."""
-        protected = np.zeros(len(self.map.keyframes), bool)
-        protected[0] = True
-        protected[-RECENT:] = True
-        return protected
 
 
 def _ends(loop: LoopResult) -> tuple[int, int]:
