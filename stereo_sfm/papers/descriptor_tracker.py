@@ -7,12 +7,13 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
+from stereo_sfm.papers.extraction import Features, feature_kind
 from stereo_sfm.papers.feature_view import FeatureView, ViewMaker
-from stereo_sfm.papers.map_correction import KeyframePoses
+from stereo_sfm.papers.matching import match_features
 from stereo_sfm.papers.point_ids import PointIds
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.descriptors import describe
-from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import F64, I64, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
 
 class DescriptorTracker:
@@ -21,6 +22,7 @@ class DescriptorTracker:
     def __init__(self, config: Config, rig: Rig, spans: NoSpans | None) -> None:
         """`rig`: the cameras whose images it uses."""
         self._config, self._odometry, self._spans = config, config.odometry, spans or NoSpans()
+        self._kind = feature_kind(config.features.kind)
         self._views = ViewMaker(config.features, rig)
         self._pixel = rig.pixel_angle
         self._ids = PointIds()
@@ -29,7 +31,7 @@ class DescriptorTracker:
         self._keyframe: FeatureView | None = None
         self._kf_id = -1
         self._odom_T_kf = np.eye(4)
-        self._kf_poses = KeyframePoses()
+        self._odom_T_kfs: dict[int, F64] = {}  # of keyframes whose update is to come
         self._frames_since_kf = 0
         self._lost = 0  # frames without a pose
         self._lost_ns = 0  # the first of these frames
@@ -48,10 +50,19 @@ class DescriptorTracker:
         """
         self._map_version = update.version
         self._ids.fuse(update.fused_point_ids)
-        moved = self._kf_poses.correct(update)
-        if moved is not None:
-            self._odom_T_cam, self._odom_T_kf = moved @ self._odom_T_cam, moved @ self._odom_T_kf
+        known = np.flatnonzero(np.isin(update.kf_ids, list(self._odom_T_kfs)))
+        if not len(known):
+            return None
+        row = known[np.argmax(update.kf_ids[known])]
+        newest = int(update.kf_ids[row])
+        moved = se3.inverse(update.map_T_odom) @ update.map_T_kf[row] @ se3.inverse(self._odom_T_kfs[newest])
+        self._odom_T_kfs = {k: moved @ pose for k, pose in self._odom_T_kfs.items() if k >= newest}
+        self._odom_T_cam, self._odom_T_kf = moved @ self._odom_T_cam, moved @ self._odom_T_kf
         return moved
+
+    def _match(self, first: Features, second: Features) -> I64:
+        """(M, 2) rows of matching features, see `match_features`."""
+        return match_features(first, second, self._kind.norm, self._config.features.ratio)
 
     def _count_lost(self, stamp_ns: int) -> float:
         """One more frame without a pose. Returns the seconds since the first of them."""
@@ -63,7 +74,7 @@ class DescriptorTracker:
         """Make a view the newest keyframe: with binary descriptors, whatever the tracker matches by, and no corners."""
         self._kf_id += 1
         self._keyframe, self._odom_T_kf = view, odom_T_cam
-        self._kf_poses.add(self._kf_id, odom_T_cam)
+        self._odom_T_kfs[self._kf_id] = odom_T_cam
         self._frames_since_kf = 0
         rows = view.ids >= 0
         uv = view.features.uv[rows]
@@ -90,6 +101,7 @@ class DescriptorTracker:
         stats: dict[str, float],
         covariance: F64 | None = None,
     ) -> Frame:
+        rows = view.ids >= 0  # those that were seen before are the inliers of the pose
         return Frame(
             frame_id=image.frame_id,
             stamp_ns=image.stamp_ns,
@@ -97,18 +109,12 @@ class DescriptorTracker:
             covariance=np.eye(6) if covariance is None else covariance,
             state=state,
             reason=reason,
-            observations=_observations(view),
+            observations=Observations(
+                view.ids[rows], view.features.uv[rows], view.uv_right[rows], view.ages[rows], view.ages[rows] > 0
+            ),
             reference_kf_id=self._kf_id,
-            kf_T_cam=se3.inverse(self._kf_poses.pose(self._kf_id)) @ self._odom_T_cam,
+            kf_T_cam=se3.inverse(self._odom_T_kfs.get(self._kf_id, np.eye(4))) @ self._odom_T_cam,
             map_version=self._map_version,
             is_keyframe=is_keyframe,
             stats={"features": float(len(view)), **stats},
         )
-
-
-def _observations(view: FeatureView) -> Observations:
-    """Rows with an id; those that were seen before are the inliers of the pose."""
-    rows = view.ids >= 0
-    return Observations(
-        view.ids[rows], view.features.uv[rows], view.uv_right[rows], view.ages[rows], view.ages[rows] > 0
-    )

@@ -39,27 +39,14 @@ class FeatureKind:
 
     def empty(self) -> U8 | F32:
         """(0, width) descriptors."""
-        binary = self.norm == cv2.NORM_HAMMING
-        return np.zeros((0, self.width), np.uint8) if binary else np.zeros((0, self.width), np.float32)
-
-
-def _orb(count: int) -> Any:
-    return cv2.ORB.create(count or 500)
-
-
-def _sift(count: int) -> Any:
-    return cv2.SIFT.create(count)
-
-
-def _akaze(count: int) -> Any:
-    return cv2.AKAZE.create(max_points=count or -1)
+        return np.zeros((0, self.width), np.uint8 if self.norm == cv2.NORM_HAMMING else np.float32)
 
 
 # The thesis compares all of them by l2; binary descriptors are compared by Hamming distance here, as they are meant to.
 TABLE: dict[str, FeatureKind] = {
-    "orb": FeatureKind(_orb, cv2.NORM_HAMMING, 32),
-    "sift": FeatureKind(_sift, cv2.NORM_L2, 128),
-    "akaze": FeatureKind(_akaze, cv2.NORM_HAMMING, 61),
+    "orb": FeatureKind(lambda count: cv2.ORB.create(count or 500), cv2.NORM_HAMMING, 32),
+    "sift": FeatureKind(lambda count: cv2.SIFT.create(count), cv2.NORM_L2, 128),
+    "akaze": FeatureKind(lambda count: cv2.AKAZE.create(max_points=count or -1), cv2.NORM_HAMMING, 61),
 }
 
 

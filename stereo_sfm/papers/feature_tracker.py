@@ -14,19 +14,20 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.motion_only import pose_covariance
+from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.descriptor_tracker import DescriptorTracker
-from stereo_sfm.papers.estimators import make_estimator
 from stereo_sfm.papers.extraction import circle_mask
 from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.papers.local_points import row_of
-from stereo_sfm.papers.motion_estimator import Motion
-from stereo_sfm.papers.pairing import Pairing
+from stereo_sfm.papers.matching import epipolar_inliers
+from stereo_sfm.papers.motion_estimator import FramePair, Motion, estimator
 from stereo_sfm.papers.step_scale import StepScale
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.types import F64, I64, U8, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
+
+_RECOVER_PX = 4.0  # how near a keyframe's point must reproject to be taken for the same point
 
 
 class FeatureTracker(DescriptorTracker):
@@ -37,9 +38,8 @@ class FeatureTracker(DescriptorTracker):
     ) -> None:
         super().__init__(config, rig, spans)
         self._place_corners = PlaceCorners.from_config(config, rig)
-        self._estimator = make_estimator(config.odometry, rig.left)
+        self._estimator = estimator(config.odometry.method).make(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
-        self._pairing = Pairing(config.features, self._pixel)
         self._last: FeatureView | None = None
         self._odom_T_last = np.eye(4)
         self._last_stamp = 0
@@ -87,10 +87,15 @@ class FeatureTracker(DescriptorTracker):
     def _begin(self, image: StereoImage, view: FeatureView) -> tuple[Frame, Keyframe | None]:
         if len(view) < self._odometry.min_inliers:
             return self._frame(image, view, TrackState.INITIALIZING, "too_few_points", False, _stats(None)), None
+        return self._begin_here(image, view, TrackState.OK, "")
+
+    def _begin_here(
+        self, image: StereoImage, view: FeatureView, state: TrackState, reason: str
+    ) -> tuple[Frame, Keyframe | None]:
         view = self._ids.give_new(view)
         keyframe = self._make_keyframe(image, view)
         self._remember(image, view)
-        return self._frame(image, view, TrackState.OK, "", True, _stats(None)), keyframe
+        return self._frame(image, view, state, reason, True, _stats(None)), keyframe
 
     def _move(
         self, image: StereoImage, view: FeatureView, rng: np.random.Generator
@@ -100,10 +105,12 @@ class FeatureTracker(DescriptorTracker):
         reference, odom_T_reference = self._last, self._odom_T_last
         if self._odometry.reference == "keyframe":
             reference, odom_T_reference = self._keyframe, self._odom_T_kf
-        rows = self._pairing.match(reference, view, rng)
-        pair = self._pairing.pair(reference, view, rows)
+        rows = self._match(reference.features, view.features)
+        if self._config.features.motion_check:
+            rays = reference.bearings[rows[:, 0]], view.bearings[rows[:, 1]]
+            rows = rows[epipolar_inliers(*rays, 2 * self._config.features.epipolar_px * self._pixel, rng)]
         try:
-            motion = self._estimator.estimate(pair, rng)
+            motion = self._estimator(_pair(reference, view, rows, self._pixel), rng)
             motion = self._scale.metric(motion, self._last_stamp, image.stamp_ns)
         except Degenerate as refusal:
             return refusal
@@ -113,8 +120,23 @@ class FeatureTracker(DescriptorTracker):
         view = self._ids.inherit(view, reference, agreed)
         if reference is not self._keyframe:
             now_T_kf = se3.inverse(self._odom_T_cam) @ self._odom_T_kf
-            view = self._pairing.recover(self._keyframe, view, now_T_kf, self._ids)
+            view = self._recover(self._keyframe, view, now_T_kf)
         return motion, self._ids.give_new(view)
+
+    def _recover(self, keyframe: FeatureView, view: FeatureView, now_T_kf: F64) -> FeatureView:
+        """Ids for points of the last keyframe that were missed in between: descriptor and position agree.
+
+        Args:
+            now_T_kf: (4, 4) by the motion just estimated.
+        """
+        free_kf = ~np.isin(self._ids.current(keyframe.ids), view.ids) & np.isfinite(keyframe.points[:, 2])
+        free_now = view.ids < 0
+        rows = self._match(keyframe.features.rows(free_kf), view.features.rows(free_now))
+        rows = np.stack([np.flatnonzero(free_kf)[rows[:, 0]], np.flatnonzero(free_now)[rows[:, 1]]], axis=1)
+        if len(rows) == 0:
+            return view
+        errors = bearing_errors(now_T_kf, keyframe.points[rows[:, 0]], view.bearings[rows[:, 1]])
+        return self._ids.inherit(view, keyframe, rows[errors < _RECOVER_PX * self._pixel])
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
         """No motion: continue with the last velocity; after some time without start a new submap there."""
@@ -125,10 +147,7 @@ class FeatureTracker(DescriptorTracker):
         self._lost = 0
         self._submap += 1
         self._velocity = np.eye(4)
-        view = self._ids.give_new(view)
-        keyframe = self._make_keyframe(image, view)
-        self._remember(image, view)
-        return self._frame(image, view, TrackState.RESTARTED, reason, True, _stats(None)), keyframe
+        return self._begin_here(image, view, TrackState.RESTARTED, reason)
 
     def _finish(
         self, image: StereoImage, view: FeatureView, motion: Motion, state: TrackState
@@ -163,6 +182,15 @@ class FeatureTracker(DescriptorTracker):
 
     def _remember(self, image: StereoImage, view: FeatureView) -> None:
         self._last, self._odom_T_last, self._last_stamp = view, self._odom_T_cam, image.stamp_ns
+
+
+def _pair(last: FeatureView, now: FeatureView, rows: I64, pixel_rad: float) -> FramePair:
+    """Matched rows (M, 2) as input of the estimators."""
+    a, b = rows.T
+    return FramePair(
+        last.bearings[a], now.bearings[b], last.points[a], now.points[b], last.sigmas[a], now.sigmas[b], pixel_rad,
+        last.image, now.image, last.frame_id, now.frame_id,
+    )  # fmt: skip
 
 
 def _stats(motion: Motion | None) -> dict[str, float]:

@@ -15,10 +15,11 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import ManhattanConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.lines import LineDetector
 from stereo_sfm.geometry.procrustes import rotation_between
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.vanishing import Manhattan, nearest_turn
-from stereo_sfm.papers.manhattan import ManhattanCompass
+from stereo_sfm.papers.manhattan import measure
 from stereo_sfm.tracking.protocol import AnyTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
@@ -84,7 +85,7 @@ class ManhattanTracker:
     def __init__(self, inner: AnyTracker, config: ManhattanConfig, rig: Rig) -> None:
         self._inner = inner
         self._config = config
-        self._compass = ManhattanCompass(rig.left)
+        self._lines = LineDetector(rig.left)
         self._filter = RotationFilter(config)
         self._outer_T_inner = np.eye(4)  # corrected odometry frame from the tracker's, now and at the last keyframe
         self._outer_T_inner_kf = np.eye(4)
@@ -106,7 +107,7 @@ class ManhattanTracker:
         good = frame.state in (TrackState.OK, TrackState.RECOVERED)
         if good and image.frame_id % self._config.every == 0:
             try:
-                found = self._compass.measure(image.left, image.frame_id, self._filter.expected(pose[:3, :3]))
+                found = measure(self._lines, image.left, image.frame_id, self._filter.expected(pose[:3, :3]))
                 turned = self._filter.correct(pose[:3, :3], found)
                 pose = se3.orthonormalize(se3.from_rotation_translation(turned, pose[:3, 3]))
                 self._outer_T_inner = se3.orthonormalize(pose @ se3.inverse(frame.odom_T_cam))

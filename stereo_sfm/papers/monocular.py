@@ -18,14 +18,13 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.descriptor_tracker import DescriptorTracker
-from stereo_sfm.papers.extraction import feature_kind
 from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.papers.local_points import LocalPoints
-from stereo_sfm.papers.matching import epipolar_inliers, match_features
+from stereo_sfm.papers.matching import epipolar_inliers
 from stereo_sfm.papers.monocular_start import MIN_MATCHES, MIN_PARALLAX_DEG, good_points, start_from
 from stereo_sfm.papers.odometry.pnp import pnp_pose
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoImage, TrackState
+from stereo_sfm.types import F64, I64, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner
 _MAX_STEP = 0.5  # of the median distance of the points: a larger step between frames is an error
@@ -38,7 +37,6 @@ class MonocularTracker(DescriptorTracker):
 
     def __init__(self, config: Config, rig: Rig, spans: NoSpans | None = None) -> None:
         super().__init__(config, Rig(rig.left, left_mask=rig.left_mask), spans)
-        self._kind = feature_kind(config.features.kind)
         self._local = LocalPoints(np.zeros(0, np.int64), np.zeros((0, 3)), self._kind.empty())
         self._first: FeatureView | None = None
         self._first_stamp, self._first_age = 0, 0
@@ -73,7 +71,7 @@ class MonocularTracker(DescriptorTracker):
         self._first_age += 1
         if self._first is None or self._first_age > _FIRST_VIEW_LASTS:
             return self._wait(image, view, "first_view", new_first=True)
-        rows = match_features(self._first.features, view.features, self._kind.norm, self._config.features.ratio)
+        rows = self._match(self._first.features, view.features)
         if len(rows) < MIN_MATCHES:
             return self._wait(image, view, "too_few_matches", new_first=True)
         try:
@@ -84,8 +82,9 @@ class MonocularTracker(DescriptorTracker):
             return self._wait(image, view, refusal.reason, new_first=False)
         found = np.isfinite(start.points[:, 2])
         rows, points = rows[found], start.points[found]
-        first = replace(self._first, points=_spread(points, rows[:, 0], len(self._first)))
-        first = self._ids.give_new(first, only=np.isfinite(first.points[:, 2]))
+        spread = np.full((len(self._first), 3), np.nan)
+        spread[rows[:, 0]] = points
+        first = self._ids.give_new(replace(self._first, points=spread), only=np.isfinite(spread[:, 2]))
         keyframe = self._enter(first, self._first_stamp, self._odom_T_cam)
         self._odom_T_cam = self._odom_T_cam @ start.first_T_second
         self._keyframe = self._ids.inherit(view, first, rows)
@@ -105,7 +104,7 @@ class MonocularTracker(DescriptorTracker):
 
     def _track(self, image: StereoImage, view: FeatureView, rng: np.random.Generator) -> tuple[Frame, Keyframe | None]:
         assert self._keyframe is not None
-        rows = match_features(self._keyframe.features, view.features, self._kind.norm, self._config.features.ratio)
+        rows = self._match(self._keyframe.features, view.features)
         known = rows[np.isfinite(self._keyframe.points[rows[:, 0], 2])]
         try:
             cam_T_kf, inliers = pnp_pose(
@@ -179,11 +178,7 @@ class MonocularTracker(DescriptorTracker):
         absent = absent[(ahead[:, 2] / np.linalg.norm(ahead, axis=1).clip(1e-9)) > 0.3]
         if len(absent) == 0 or len(free) < 2:
             return view
-        mask: Bool = np.zeros(len(view), bool)
-        mask[free] = True
-        pairs = match_features(
-            self._local.features(absent), view.features.rows(mask), self._kind.norm, self._config.features.ratio
-        )
+        pairs = self._match(self._local.features(absent), view.features.rows(view.ids < 0))
         local, row = absent[pairs[:, 0]], free[pairs[:, 1]]
         near = bearing_errors(cam_T_odom, self._local.points[local], view.bearings[row]) < _REPROJECT_PX * self._pixel
         ids, ages = view.ids.copy(), view.ages.copy()
@@ -208,10 +203,3 @@ class MonocularTracker(DescriptorTracker):
         """Its points are matched with later keyframes, too."""
         self._local.add(view, odom_T_cam)
         return super()._enter(view, stamp_ns, odom_T_cam)
-
-
-def _spread(values: F64, rows: I64, count: int) -> F64:
-    """(count, 3) with `values` at `rows`, NaN elsewhere."""
-    out = np.full((count, 3), np.nan)
-    out[rows] = values
-    return out

@@ -15,10 +15,8 @@ from stereo_sfm.geometry.stereo import triangulate
 from stereo_sfm.geometry.two_view import essential_from_motion, parallax_angles
 from stereo_sfm.types import F64, Bool, Message
 
-MIN_MATCHES, MIN_POINTS = (
-    50,
-    40,
-)  # matches, and points of them, of a start: a map that the next views can be matched with
+# Matches, and points of them, of a start: a map that the next views can be matched with.
+MIN_MATCHES, MIN_POINTS = 50, 40
 MIN_PARALLAX_DEG = 1.0  # least median of a start, and of new points: depths are then known to some percent
 
 

@@ -1,17 +1,19 @@
-"""Input and output of motion estimators. One estimator per file of `odometry/`."""
+"""Motion estimators: their input and output. `odometry/` has one a file, each with an `ESTIMATOR`."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from functools import partial
 
 import numpy as np
 
-from stereo_sfm.config import OdometryConfig
+from stereo_sfm.config import OdometryConfig, estimator_names
+from stereo_sfm.errors import one_of
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.types import F64, U8, Bool, Message
+from stereo_sfm.types import F64, I64, U8, Bool, Message
 
 SHIFTS = 8  # random pairings that `refuse_chance` compares with ...
 BETTER_THAN_CHANCE = 3.0  # ... and how many times nearer a motion must bring the points
@@ -33,10 +35,20 @@ class FramePair(Message):
     frame_id_last: int
     frame_id_now: int
 
-    @property
-    def both(self) -> Bool:
-        """(N,) rows with a 3D point on both sides."""
-        return np.isfinite(self.points_last[:, 2]) & np.isfinite(self.points_now[:, 2])
+    def rows_with_points(self, least: int) -> I64:
+        """Rows with a 3D point on both sides.
+
+        Raises:
+            Degenerate: "too_few_points", fewer than `least`.
+        """
+        rows = np.flatnonzero(np.isfinite(self.points_last[:, 2]) & np.isfinite(self.points_now[:, 2]))
+        if len(rows) < least:
+            raise Degenerate("too_few_points", f"{len(rows)} matches have depth on both sides")
+        return rows
+
+    def marked(self, rows: I64) -> Bool:
+        """(N,) True at these rows."""
+        return np.isin(np.arange(len(self.bearings_now)), rows)
 
     @property
     def sigmas(self) -> F64:
@@ -55,16 +67,8 @@ class Motion(Message):
     stats: dict[str, float] = field(default_factory=dict[str, float])
 
 
-class Estimator(Protocol):
-    """One file of this folder each."""
-
-    def estimate(self, pair: FramePair, rng: np.random.Generator) -> Motion:
-        """Motion between the two frames.
-
-        Raises:
-            Degenerate: the data do not determine it; the reason is a short stable word.
-        """
-        ...
+# Motion between the two frames; raises Degenerate, with a short stable word, where the data do not determine it.
+Estimator = Callable[[FramePair, np.random.Generator], Motion]
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,23 @@ class EstimatorEntry:
     summary: str
     make: Callable[[OdometryConfig, Camera], Estimator]  # for the images of a camera
     needs_depth: bool  # it turns 3D points of the current frame into motion: a second camera or depth images
+
+    @staticmethod
+    def of(
+        summary: str, estimate: Callable[[OdometryConfig, FramePair, np.random.Generator], Motion], needs_depth: bool
+    ) -> EstimatorEntry:
+        """Of one that needs nothing but its settings."""
+        return EstimatorEntry(summary, lambda config, camera: partial(estimate, config), needs_depth)
+
+
+def estimator(name: str) -> EstimatorEntry:
+    """The estimator that `--odometry` names.
+
+    Raises:
+        StereoSfmError: unknown name.
+    """
+    one_of(name, ("flow", *estimator_names()), "odometry")
+    return importlib.import_module(f"stereo_sfm.papers.odometry.{name.replace('-', '_')}").ESTIMATOR
 
 
 def thresholds(config: OdometryConfig, sigmas: F64) -> F64:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.papers.estimators import estimator
+from stereo_sfm.papers.motion_estimator import estimator
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.protocol import AnyTracker
 from stereo_sfm.types import Trajectory

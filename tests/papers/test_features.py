@@ -10,7 +10,7 @@ from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.papers.extraction import TABLE, Extractor, circle_mask, feature_kind
-from stereo_sfm.papers.matching import _two_nearest, epipolar_inliers, match_features
+from stereo_sfm.papers.matching import epipolar_inliers, match_features
 from stereo_sfm.types import F64, U8
 
 SHIFT = np.array([7.0, -3.0])
@@ -67,17 +67,6 @@ def test_the_mask_keeps_features_near_its_points() -> None:
     nearest = np.linalg.norm(found.uv[:, None] - centres[None], axis=2).min(axis=1)
     assert len(found) > 3
     assert nearest.max() < 27
-
-
-def test_two_nearest_by_matrix_product_are_those_of_opencv() -> None:
-    image = texture(3)
-    extractor = Extractor(FeaturesConfig(kind="sift"))
-    first, second = extractor.extract(image), extractor.extract(moved(image))
-    target, best, second_best = _two_nearest(first, second, cv2.NORM_L2)
-    pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(first.descriptors, second.descriptors, k=2)
-    np.testing.assert_allclose(best, [a.distance for a, _ in pairs], rtol=1e-6)
-    np.testing.assert_allclose(second_best, [b.distance for _, b in pairs], rtol=1e-6)
-    assert (target == [a.trainIdx for a, _ in pairs]).mean() > 0.99  # ties may be broken otherwise
 
 
 def test_unknown_features_are_one_clear_line() -> None:

@@ -13,8 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.papers.estimators import estimator, make_estimator
-from stereo_sfm.papers.motion_estimator import FramePair, Motion
+from stereo_sfm.papers.motion_estimator import FramePair, Motion, estimator
 from stereo_sfm.papers.step_scale import StepScale
 from stereo_sfm.types import F64, Trajectory
 from tests.papers.synthetic_views import PIXEL, frame_pair, unit
@@ -27,7 +26,7 @@ ROBUST = ["em-r", "r-um", "eight-point", "pnp"]
 
 def estimate(name: str, pair: FramePair, **options: object) -> Motion:
     config = replace(OdometryConfig(method=name), **options)
-    return make_estimator(config, CAMERA).estimate(pair, np.random.default_rng(0))
+    return estimator(name).make(config, CAMERA)(pair, np.random.default_rng(0))
 
 
 def errors(motion: Motion, truth: F64) -> tuple[float, float]:
@@ -176,7 +175,7 @@ def test_ground_truth_scale_is_the_true_step() -> None:
 
 def test_wrong_names_are_one_clear_line() -> None:
     with pytest.raises(StereoSfmError, match="em-r"):
-        make_estimator(OdometryConfig(method="magic"), CAMERA)
+        estimator("magic")
     with pytest.raises(StereoSfmError, match="unit"):
         StepScale(OdometryConfig(scale="ground-truth"), None)
     with pytest.raises(StereoSfmError, match="unknown"):

@@ -12,9 +12,10 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt
+from stereo_sfm.geometry.lines import LineDetector
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.vanishing import nearest_turn
-from stereo_sfm.papers.manhattan import ManhattanCompass
+from stereo_sfm.papers.manhattan import measure
 from stereo_sfm.papers.motion_estimator import FramePair
 from stereo_sfm.papers.odometry.vp_r import VpR
 from stereo_sfm.types import F64, U8
@@ -28,10 +29,10 @@ def orientations(spec: str) -> tuple[list[F64], list[F64], list[F64]]:
     covariances: list[F64] = []
     with open_source(spec) as source:
         assert source.ground_truth is not None
-        compass = ManhattanCompass(source.rig.left)
+        lines = LineDetector(source.rig.left)
         for image in source:
             row = int(np.searchsorted(source.ground_truth.stamp_ns, image.stamp_ns))
-            found = compass.measure(image.left, image.frame_id, measured[-1] if measured else None)
+            found = measure(lines, image.left, image.frame_id, measured[-1] if measured else None)
             measured.append(found.cam_R_axes)
             covariances.append(found.covariance)
             truth.append(source.ground_truth.poses[row, :3, :3].T)
@@ -71,8 +72,8 @@ def test_a_scene_without_structure_is_declined() -> None:
     camera = KannalaBrandt(424, 400, 142.0, 142.0, 212.0, 200.0, (-0.004, 0.038, -0.036, 0.006))
     image = picture_of_nothing(camera.size)
     with pytest.raises(Degenerate, match=r"weak_structure|too_few_lines"):
-        ManhattanCompass(camera).measure(image, 0)
+        measure(LineDetector(camera), image, 0)
     pair = frame_pair(np.eye(4))
     blank = FramePair(**{**vars(pair), "image_last": image, "image_now": image})
     with pytest.raises(Degenerate, match=r"weak_structure|too_few_lines"):
-        VpR(OdometryConfig(method="vp-r"), camera).estimate(blank, np.random.default_rng(0))
+        VpR(OdometryConfig(method="vp-r"), camera)(blank, np.random.default_rng(0))

@@ -1,1 +1,1 @@
-"""One odometry estimator per file; `TABLE` names them."""
+"""One odometry estimator per file."""

@@ -6,7 +6,6 @@ import numpy as np
 
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.procrustes import translation_ransac
-from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.motion_estimator import FramePair, thresholds, weights
 from stereo_sfm.types import F64, Bool
 
@@ -19,9 +18,7 @@ def translation_for(
     Raises:
         Degenerate: "too_few_points" without enough points on both sides, else as `translation_ransac`.
     """
-    rows = np.flatnonzero(pair.both)
-    if len(rows) < config.min_inliers:
-        raise Degenerate("too_few_points", f"{len(rows)} matches have depth on both sides")
+    rows = pair.rows_with_points(config.min_inliers)
     sigmas = pair.sigmas[rows]
     translation, consensus = translation_ransac(
         pair.points_last[rows] @ rotation.T,
@@ -30,6 +27,4 @@ def translation_for(
         rng,
         weights(config, sigmas),
     )
-    inliers = np.zeros(len(pair.bearings_now), bool)
-    inliers[rows[consensus.inliers]] = True
-    return translation, inliers
+    return translation, pair.marked(rows[consensus.inliers])

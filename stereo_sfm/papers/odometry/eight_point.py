@@ -6,10 +6,12 @@ any, else the tracker decides (unit steps, or ground truth).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from stereo_sfm.config import OdometryConfig
-from stereo_sfm.geometry.essential import relative_pose
+from stereo_sfm.geometry.essential import RelativePose, relative_pose
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 
@@ -40,35 +42,33 @@ def scale_from_points(rotation: np.ndarray, direction: np.ndarray, pair: FramePa
     return float(steps[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
 
 
-class EightPoint:
-    """2D-2D motion between two views."""
+def motion_of_rays(
+    config: OdometryConfig, pair: FramePair, rng: np.random.Generator, **options: Any
+) -> tuple[RelativePose, dict[str, float]]:
+    """Rotation and direction of the matches' rays, and the statistics of a `Motion` from them.
 
-    def __init__(self, config: OdometryConfig) -> None:
-        self._config = config
+    Args: options, of `relative_pose`.
+    """
+    threshold = config.epipolar_px * pair.pixel_rad
+    pose = relative_pose(
+        pair.bearings_last, pair.bearings_now, threshold, rng, refine=config.refine, max_samples=config.max_samples,
+        **options,
+    )  # fmt: skip
+    return pose, {"parallax_deg": float(np.degrees(pose.parallax)), "pure_rotation": float(pose.pure_rotation)}
 
-    def estimate(self, pair: FramePair, rng: np.random.Generator) -> Motion:
-        """See `Estimator`."""
-        config = self._config
-        pose = relative_pose(
-            pair.bearings_last,
-            pair.bearings_now,
-            config.epipolar_px * pair.pixel_rad,
-            rng,
-            method="eight_point",
-            refine=config.refine,
-            max_samples=config.max_samples,
-        )
-        stats = {"parallax_deg": float(np.degrees(pose.parallax)), "pure_rotation": float(pose.pure_rotation)}
-        if pose.pure_rotation:
-            return Motion(pose.rotation, np.zeros(3), pose.inliers, stats=stats)
-        if config.scale != "stereo":
-            return Motion(pose.rotation, pose.direction, pose.inliers, metric=False, stats=stats)
+
+def _estimate(config: OdometryConfig, pair: FramePair, rng: np.random.Generator) -> Motion:
+    pose, stats = motion_of_rays(config, pair, rng, method="eight_point")
+    step, metric = 1.0, True
+    if pose.pure_rotation:
+        step = 0.0
+    elif config.scale != "stereo":
+        metric = False
+    else:
         step = scale_from_points(pose.rotation, pose.direction, pair, pose.inliers)
-        return Motion(pose.rotation, step * pose.direction, pose.inliers, stats=stats)
+    return Motion(pose.rotation, step * pose.direction, pose.inliers, metric, stats)
 
 
-ESTIMATOR = EstimatorEntry(
-    "essential matrix by eight points (sparse localization paper)",
-    lambda config, camera: EightPoint(config),
-    needs_depth=False,
+ESTIMATOR = EstimatorEntry.of(
+    "essential matrix by eight points (sparse localization paper)", _estimate, needs_depth=False
 )

@@ -37,15 +37,9 @@ def pnp_ransac(
     matrix = np.diag([focal, focal, 1.0])
     cv2.setRNGSeed(int(rng.integers(1 << 31)))
     result: Any = cv2.solvePnPRansac(
-        np.ascontiguousarray(points[usable]),
-        plane,
-        matrix,
-        np.zeros(4),
-        iterationsCount=max_samples,
-        reprojectionError=2.0,
-        confidence=0.9999,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
+        np.ascontiguousarray(points[usable]), plane, matrix, np.zeros(4), iterationsCount=max_samples,
+        reprojectionError=2.0, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
+    )  # fmt: skip
     found, rvec, tvec, inliers = result
     if not found or inliers is None or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
         raise Degenerate("no_consensus", "no pose agrees with the points")
@@ -74,23 +68,11 @@ def pnp_pose(
     return cam_T_ref, inliers
 
 
-class Pnp:
-    """2D-3D motion: the last frame's (or keyframe's) points seen now."""
-
-    def __init__(self, config: OdometryConfig) -> None:
-        self._config = config
-
-    def estimate(self, pair: FramePair, rng: np.random.Generator) -> Motion:
-        """See `Estimator`."""
-        rows = np.flatnonzero(np.isfinite(pair.points_last[:, 2]))
-        now_T_last, chosen = pnp_pose(
-            pair.points_last[rows], pair.bearings_now[rows], pair.pixel_rad, self._config, rng
-        )
-        inliers = np.zeros(len(pair.bearings_now), bool)
-        inliers[rows[chosen]] = True
-        return Motion(now_T_last[:3, :3], now_T_last[:3, 3], inliers)
+def _estimate(config: OdometryConfig, pair: FramePair, rng: np.random.Generator) -> Motion:
+    """The last frame's (or keyframe's) points seen now."""
+    rows = np.flatnonzero(np.isfinite(pair.points_last[:, 2]))
+    now_T_last, chosen = pnp_pose(pair.points_last[rows], pair.bearings_now[rows], pair.pixel_rad, config, rng)
+    return Motion(now_T_last[:3, :3], now_T_last[:3, 3], pair.marked(rows[chosen]))
 
 
-ESTIMATOR = EstimatorEntry(
-    "perspective-n-point (C++ course system)", lambda config, camera: Pnp(config), needs_depth=False
-)
+ESTIMATOR = EstimatorEntry.of("perspective-n-point (C++ course system)", _estimate, needs_depth=False)

@@ -10,9 +10,10 @@ import numpy as np
 
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.lines import LineDetector
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.geometry.vanishing import Manhattan, ManhattanLimits
-from stereo_sfm.papers.manhattan import ManhattanCompass
+from stereo_sfm.geometry.vanishing import Manhattan
+from stereo_sfm.papers.manhattan import measure
 from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 from stereo_sfm.papers.odometry._translation import translation_for
 from stereo_sfm.types import U8
@@ -23,11 +24,11 @@ class VpR:
 
     def __init__(self, config: OdometryConfig, camera: Camera) -> None:
         self._config = config
-        self._compass = ManhattanCompass(camera, ManhattanLimits())
+        self._lines = LineDetector(camera)
         self._known: dict[int, Manhattan] = {}  # orientation of the last frames, by frame id
 
-    def estimate(self, pair: FramePair, rng: np.random.Generator) -> Motion:
-        """See `Estimator`."""
+    def __call__(self, pair: FramePair, rng: np.random.Generator) -> Motion:
+        """Motion of a pair."""
         last = self._orientation(pair.frame_id_last, pair.image_last, None)
         now = self._orientation(pair.frame_id_now, pair.image_now, last)
         self._known = {pair.frame_id_last: last, pair.frame_id_now: now}
@@ -40,13 +41,7 @@ class VpR:
 
     def _orientation(self, frame_id: int, image: U8, near: Manhattan | None) -> Manhattan:
         known = self._known.get(frame_id)
-        if known is not None:
-            return known
-        return self._compass.measure(image, frame_id, None if near is None else near.cam_R_axes)
+        return known or measure(self._lines, image, frame_id, None if near is None else near.cam_R_axes)
 
 
-ESTIMATOR = EstimatorEntry(
-    "vanishing points, then 1-point translation (retail paper)",
-    lambda config, camera: VpR(config, camera),
-    needs_depth=True,
-)
+ESTIMATOR = EstimatorEntry("vanishing points, then 1-point translation (retail paper)", VpR, needs_depth=True)
