@@ -82,11 +82,12 @@ class Rows(NamedTuple):
 
 
 @njit
-def linearize(rot, pos, points, rows, trust, use, limit, cameras, scale, redescends, joint, out):
+def linearize(own, rot, pos, points, rows, trust, use, limit, cameras, scale, redescends, joint, out):
     """Residuals and their quadratic model at one state.
 
     Args:
-        rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world. rows: Rows. cameras: StereoCameras.
+        own: (N,) those of the rows. rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world. rows: Rows.
+        cameras: StereoCameras.
         trust: (P,) factor of the loss of a point's right images, if joint of both.
         use: (M, 2) images that count. limit: if above 0, `use` is set here to those whose chi2 is not above it.
         scale, redescends: of the loss, see `_loss`. joint: one loss over both images instead of one each.
@@ -102,7 +103,7 @@ def linearize(rot, pos, points, rows, trust, use, limit, cameras, scale, redesce
     r00, r01, r02, r10, r11, r12 = t[0, 0], t[0, 1], t[0, 2], t[1, 0], t[1, 1], t[1, 2]
     r20, r21, r22 = t[2, 0], t[2, 1], t[2, 2]
     cost = 0.0
-    for o in range(obs_kf.shape[0]):
+    for o in own:
         k, i = obs_kf[o], obs_pt[o]
         d0, d1, d2 = points[i, 0] - pos[k, 0], points[i, 1] - pos[k, 1], points[i, 2] - pos[k, 2]
         p0 = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
@@ -146,18 +147,18 @@ def linearize(rot, pos, points, rows, trust, use, limit, cameras, scale, redesce
 
 
 @njit
-def add_disparity_errors(rot, pos, points, rows, use, cameras, total, information):
+def add_disparity_errors(own, rot, pos, points, rows, use, cameras, total, information):
     """Add, by point, the weighted disparity errors of its observations in both images.
 
     The error is the right pixel's residual less the left one's, along the epipolar curve, positive towards nearer.
 
     Args:
-        rot, pos, points, rows, use, cameras: as of `linearize`.
+        own, rot, pos, points, rows, use, cameras: as of `linearize`.
         total (P,), information (P,): the sums of weight^2 times error, and of weight^2, are added.
     """
     obs_kf, obs_pt, uv_left, uv_right, weights = rows
     t = cameras.right_T_left
-    for o in range(obs_kf.shape[0]):
+    for o in own:
         if not (use[o, 0] and use[o, 1]):
             continue
         k, i = obs_kf[o], obs_pt[o]
@@ -277,7 +278,10 @@ def prior_cost(points, x0, h, g):
 def point_blocks(points, x0, q, prior_g, damping, h, g):
     """Turns the sums of the moving keyframes, h (P, 6) and g (P, 3), into (H_point + damping diag)^-1 and b_point.
 
-    Both are zero for a point whose block is singular: nothing sees it. q, prior_g: the priors' H (P, 6) and g (P, 3).
+    Both are zero for a point whose block is singular: nothing sees it.
+
+    Args:
+        x0, q, prior_g: the priors' (P, 3), H (P, 6) and g (P, 3). damping: (P,).
     """
     for i in range(points.shape[0]):
         d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]
@@ -288,9 +292,9 @@ def point_blocks(points, x0, q, prior_g, damping, h, g):
         h00, h01, h02 = h[i, 0] + q0, h[i, 1] + q1, h[i, 2] + q2
         h11, h12, h22 = h[i, 3] + q3, h[i, 4] + q4, h[i, 5] + q5
         scale = (h00 + h11 + h22) / 3.0
-        h00 += damping * h00
-        h11 += damping * h11
-        h22 += damping * h22
+        h00 += damping[i] * h00
+        h11 += damping[i] * h11
+        h22 += damping[i] * h22
         c00 = h11 * h22 - h12 * h12
         c01 = h02 * h12 - h01 * h22
         c02 = h01 * h12 - h02 * h11
