@@ -17,8 +17,9 @@ from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.culling import OF_A_VIEW, SAME_VIEW_DEPTHS
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_only import adjust_pose
-from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, I64, Bool, Keyframe
+
+ALIKE_COS = 0.8  # cosine of 37 degrees, up to which a view of a point looks like the first
 
 
 def find_again(
@@ -71,19 +72,23 @@ def _local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, c
 
 
 def _points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
-    """Points of keyframes visible from this pose at a similar angle and distance: rows, left and right px or NaN."""
+    """Points of keyframes visible from this pose: rows, left and right px or NaN.
+
+    From less than half or more than twice the distance at which it was seen first, or another side, a point looks
+    otherwise.
+    """
     points = map_.points
     rows = map_.points_of_keyframes(keyframes)
     rows = rows[points.alive[rows] & np.isfinite(points.xyz[rows, 0])]
-    uv_left, uv_right = np.empty((2, len(rows), 2))
-    map_kernels.predict(
-        points.xyz[rows], map_.keyframes.map_T_kf[points.anchor[rows], :3, 3], map_T_kf, se3.inverse(map_T_kf),
-        StereoCameras.of_any(rig), uv_left, uv_right,
-    )  # fmt: skip
+    xyz = points.xyz[rows]
+    then, now = xyz - map_.keyframes.map_T_kf[points.anchor[rows], :3, 3], xyz - map_T_kf[:3, 3]
+    far, near = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
+    alike = (near < 2 * far) & (far < 2 * near) & ((then * now).sum(axis=1) > ALIKE_COS * far * near)
+    rows, in_left = rows[alike], se3.transform(se3.inverse(map_T_kf), xyz[alike])
+    uv_left = rig.left.project(in_left)
     visible = rig.left.inside(uv_left, 2.0)
-    if rig.right is None:
-        uv_right[:] = np.nan
-    return rows[visible], uv_left[visible], uv_right[visible]
+    uv_left, in_left = uv_left[visible], in_left[visible]
+    return rows[visible], uv_left, np.full_like(uv_left, np.nan) if rig.right is None else rig.project_right(in_left)
 
 
 def _agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> Bool:

@@ -11,7 +11,6 @@ import numpy as np
 from stereo_sfm.geometry.hamming import BITS, hamming
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
-from stereo_sfm.geometry.se3_kernels import transform_point
 
 
 @njit
@@ -27,6 +26,16 @@ def list_observations(points, head, following, out):
         while o >= 0:
             out[n] = o
             n += 1
+            o = following[o]
+
+
+@njit
+def count_by_keyframe(points, head, following, obs_kf, counts):
+    """Adds to counts (K,) how many of these points every keyframe sees."""
+    for i in range(points.shape[0]):
+        o = head[points[i]]
+        while o >= 0:
+            counts[obs_kf[o]] += 1
             o = following[o]
 
 
@@ -81,29 +90,6 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
             o = following[o]
         out[i, 0] = math.sqrt(squared / max(n, 1))
         out[i, 1] = max(2.0 * math.asin(min(math.sqrt(chord) / 2.0, 1.0)), widest)
-
-
-@njit
-def predict(xyz, anchors, map_T_kf, kf_T_map, cameras, uv_left, uv_right):
-    """Fills uv_left and uv_right (N, 2) with the predicted pixels of points in a keyframe; NaN where not recognisable.
-
-    Args:
-        xyz: (N, 3) in the map. anchors: (N, 3) where the keyframes stood that saw them first: from less than half or
-            more than twice that distance, or a direction whose cosine to that one is below 0.8, they look otherwise.
-        cameras: StereoCameras.
-    """
-    for i in range(xyz.shape[0]):
-        uv_left[i, 0] = uv_left[i, 1] = uv_right[i, 0] = uv_right[i, 1] = math.nan
-        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        a0, a1, a2 = x - anchors[i, 0], y - anchors[i, 1], z - anchors[i, 2]
-        b0, b1, b2 = x - map_T_kf[0, 3], y - map_T_kf[1, 3], z - map_T_kf[2, 3]
-        then, now = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
-        if now >= 4.0 * then or then >= 4.0 * now or a0 * b0 + a1 * b1 + a2 * b2 <= 0.8 * math.sqrt(then * now):
-            continue
-        p0, p1, p2 = transform_point(kf_T_map, x, y, z)
-        uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(cameras.model_l, cameras.params_l, p0, p1, p2)
-        p0, p1, p2 = transform_point(cameras.right_T_left, p0, p1, p2)
-        uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(cameras.model_r, cameras.params_r, p0, p1, p2)
 
 
 @njit
