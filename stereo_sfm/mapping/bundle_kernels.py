@@ -200,6 +200,13 @@ def _by_pose(x, y, z, p0, p1, p2):
 
 
 @inlined
+def _add(row, v):
+    """Adds six numbers to a row."""
+    row[0], row[1], row[2] = row[0] + v[0], row[1] + v[1], row[2] + v[2]
+    row[3], row[4], row[5] = row[3] + v[3], row[4] + v[4], row[5] + v[5]
+
+
+@inlined
 def _cross_block(a, p, r, o, k, w, n):
     """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
     for c in range(3):
@@ -213,24 +220,25 @@ def _cross_block(a, p, r, o, k, w, n):
 def pose_blocks(obs_kf, free, lin, h, b):
     """Adds G^T A G and -G^T g of every observation of a free keyframe to h (F, 6, 6) and b (F, 6)."""
     a, g, p, _ = lin
-    one, w = np.zeros((1, 3, 3)), np.zeros((1, 18))
-    one[0, 0, 0] = one[0, 1, 1] = one[0, 2, 2] = 1.0
     for o in range(obs_kf.shape[0]):
         c = free[obs_kf[o]]
         if c < 0:
             continue
         p0, p1, p2 = p[o, 0], p[o, 1], p[o, 2]
-        pull = _by_pose(g[o, 0], g[o, 1], g[o, 2], p0, p1, p2)
-        _cross_block(a, p, one, o, 0, w, 0)  # G^T A
-        for i in range(6):
-            b[c, i] -= pull[i]
-            column = _by_pose(w[0, i], w[0, 6 + i], w[0, 12 + i], p0, p1, p2)
-            for j in range(i, 6):
-                h[c, j, i] += column[j]
+        x = _by_pose(a[o, 0], a[o, 1], a[o, 2], p0, p1, p2)  # columns of G^T A
+        y = _by_pose(a[o, 1], a[o, 3], a[o, 4], p0, p1, p2)
+        z = _by_pose(a[o, 2], a[o, 4], a[o, 5], p0, p1, p2)
+        _add(h[c, 0], _by_pose(x[0], y[0], z[0], p0, p1, p2))
+        _add(h[c, 1], _by_pose(x[1], y[1], z[1], p0, p1, p2))
+        _add(h[c, 2], _by_pose(x[2], y[2], z[2], p0, p1, p2))
+        _add(h[c, 3], _by_pose(x[3], y[3], z[3], p0, p1, p2))
+        _add(h[c, 4], _by_pose(x[4], y[4], z[4], p0, p1, p2))
+        _add(h[c, 5], _by_pose(x[5], y[5], z[5], p0, p1, p2))
+        _add(b[c], _by_pose(-g[o, 0], -g[o, 1], -g[o, 2], p0, p1, p2))
     for c in range(h.shape[0]):
         for i in range(6):
             for k in range(i + 1, 6):
-                h[c, i, k] = h[c, k, i]
+                h[c, k, i] = h[c, i, k]
 
 
 @njit
