@@ -1,4 +1,4 @@
-"""Full bundle adjustment of a large map, one core: time, memory, and the size from which fronts are faster.
+"""Full bundle adjustment of a large map, one core: time, memory, and the size from which the sparse solver is faster.
 
     python benchmarks/full_ba.py            1,000 keyframes, 100,000 points, 600,000 observations
     python benchmarks/full_ba.py --solvers  one step of either solver at growing numbers of keyframes
@@ -90,7 +90,7 @@ def solvers() -> None:
             start = time.perf_counter()
             bundle_adjust(rig, bundle, config)
             times.append((time.perf_counter() - start) * 1e3)
-        print(f"{keyframes:5d} keyframes: dense {times[0]:8.1f} ms, by fronts {times[1]:8.1f} ms")
+        print(f"{keyframes:5d} keyframes: dense {times[0]:8.1f} ms, sparse {times[1]:8.1f} ms")
 
 
 if __name__ == "__main__":

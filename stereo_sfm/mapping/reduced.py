@@ -1,8 +1,6 @@
-"""The reduced camera system of bundle adjustment: its block pattern, and its solution, dense or by fronts.
+"""The reduced camera system of bundle adjustment: its block pattern, and its solution, dense or sparse.
 
-Windows are solved by a dense Cholesky factorisation, the full map by a multifrontal one (Liu, SIAM Review 34, 1992):
-keyframes are eliminated in the order of a nested dissection, a front of them at a time by dense factorisations of
-LAPACK, and what is left of a front is added to its parent.
+Windows are solved by a dense Cholesky factorisation, the full map by SuperLU in the order of the minimum degree.
 """
 
 from __future__ import annotations
@@ -11,13 +9,12 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIssue, reportUnknownVariableType]
+from scipy.sparse.linalg import splu
 
 from stereo_sfm.mapping import bundle_kernels
-from stereo_sfm.mapping.front_factor import FrontFactor, FrontPattern
-from stereo_sfm.mapping.nested_dissection import fronts_of
 from stereo_sfm.types import F64, I64
 
-DENSE_KEYFRAMES = 300  # above, the factorisation by fronts is faster (benchmarks/full_ba.py --solvers)
+DENSE_KEYFRAMES = 300  # above, the sparse factorisation is faster (benchmarks/full_ba.py --solvers)
 
 
 class ReducedSystem:
@@ -43,8 +40,10 @@ class ReducedSystem:
         unique, slots = np.unique(np.concatenate([diagonal, keys]), return_inverse=True)
         self.count, self._slots, self._diagonal = len(unique), slots[n:].astype(np.int32), slots[:n]
         rows, cols = np.divmod(unique, n)
-        graph = scipy.sparse.csr_array((np.ones(len(rows), np.int8), (rows, cols)), shape=(n, n))
-        self._fronts = FrontPattern(fronts_of(scipy.sparse.csr_array(graph + graph.T)), rows, cols)
+        self._lower = np.flatnonzero(rows != cols)  # blocks that stand above the diagonal, too, transposed
+        columns, rows = np.append(cols, rows[self._lower]), np.append(rows, cols[self._lower])
+        self._order = np.lexsort((rows, columns))
+        self._rows, self._starts = rows[self._order], np.searchsorted(columns[self._order], np.arange(n + 1))
 
     @property
     def slots(self) -> NDArray[np.int32]:
@@ -59,10 +58,17 @@ class ReducedSystem:
 
     def solve(self, blocks: F64, b: F64) -> F64 | None:
         """(F, 6) step, or None where the matrix is not positive definite."""
-        if self.dense:
-            return self._solve_dense(blocks, b)
-        factor = FrontFactor.of(self._fronts, blocks)
-        return None if factor is None else factor.solve(b)
+        return self._solve_dense(blocks, b) if self.dense else self._solve_sparse(blocks, b)
+
+    def _solve_sparse(self, blocks: F64, b: F64) -> F64 | None:
+        both = np.concatenate([blocks, blocks[self._lower].mT])[self._order].mT  # of the transpose, by rows
+        shape = (6 * self.size,) * 2
+        matrix = scipy.sparse.bsr_array((both, self._rows, self._starts), shape=shape).tocsr().T
+        try:  # without pivots, which a positive definite matrix does not need
+            factor = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        except RuntimeError:  # singular
+            return None
+        return factor.solve(b.ravel()).reshape(-1, 6)
 
     def _solve_dense(self, blocks: F64, b: F64) -> F64 | None:
         n = self.size
