@@ -29,7 +29,7 @@ from tests.fleet.s3_server import BUCKET, Server
 from tests.loop.store_sequence import make_sequence
 from tests.maps.maps import map_of_sequence, same
 
-NODES = 3
+NODES, STARTS = 3, 10
 FAILING, HELD_S = 0.1, 20.0
 PLAN = '[fleet]\nroot = "{root}"\n[job]\nmemory_gb = 0.0\nminutes = 30.0\nretries = 20\n'
 POINTS, KEYFRAMES = 60, 12  # of a keyframe, of a session: a tiny store's map
@@ -103,6 +103,23 @@ def make_sessions(folder: Path, nights: int) -> list[Path]:
     return out
 
 
+def started_cluster() -> Any:
+    """Several nodes on this computer. A busy one needs some tries, since Ray waits 15 s for each node."""
+    from ray.cluster_utils import Cluster
+
+    for attempt in range(STARTS):
+        cluster: Any = Cluster()
+        try:
+            for node in range(NODES):
+                cluster.add_node(num_cpus=1, **({} if node else {"include_dashboard": False}))
+            return cluster
+        except Exception:  # Ray raises nothing narrower
+            cluster.shutdown()
+            if attempt == STARTS - 1:
+                raise
+    raise AssertionError  # the count does not end
+
+
 def night_of(k: int) -> str:
     return f"2026-11-{20 + k:02d}"
 
@@ -147,11 +164,7 @@ def nights(
         put_session(folder / "hand", load_map(session), session.name, Config(), compress=False)
     chain, plan, chance = Chain(stores, sessions), folder / "plan.toml", random.Random(seed)
     plan.write_text(PLAN.format(root=chain.root))
-    from ray.cluster_utils import Cluster
-
-    cluster: Any = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
-    for _ in range(NODES - 1):
-        cluster.add_node(num_cpus=1)
+    cluster = started_cluster()
     killer, begin, drivers, cut = Killer(kills, pause_s, seed), time.perf_counter(), 0, (0, "")
     s3.faults(FAILING)
 
