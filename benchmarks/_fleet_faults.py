@@ -103,14 +103,14 @@ def make_sessions(folder: Path, nights: int) -> list[Path]:
     return out
 
 
-def started_cluster() -> Any:
+def started_cluster(nodes: int) -> Any:
     """Several nodes on this computer. A busy one needs some tries, since Ray waits 15 s for each node."""
     from ray.cluster_utils import Cluster
 
     for attempt in range(STARTS):
         cluster: Any = Cluster()
         try:
-            for node in range(NODES):
+            for node in range(nodes):
                 cluster.add_node(num_cpus=1, **({} if node else {"include_dashboard": False}))
             return cluster
         except Exception:  # Ray raises nothing narrower
@@ -164,7 +164,7 @@ def nights(
         put_session(folder / "hand", load_map(session), session.name, Config(), compress=False)
     chain, plan, chance = Chain(stores, sessions), folder / "plan.toml", random.Random(seed)
     plan.write_text(PLAN.format(root=chain.root))
-    cluster = started_cluster()
+    cluster = started_cluster(NODES)
     killer, begin, drivers, cut = Killer(kills, pause_s, seed), time.perf_counter(), 0, (0, "")
     s3.faults(FAILING)
 

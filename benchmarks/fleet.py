@@ -29,12 +29,13 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 import _figures
+from _fleet_costs import delta, info, overhead
 from _fleet_faults import nights, two_writers
 from _fleet_verdicts import Verdicts
 
 from tests.fleet.s3_server import server
 
-PARTS = ("writers", "nights")
+PARTS = ("writers", "nights", "overhead", "info", "delta")
 
 
 def main() -> None:
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--nights", type=int, default=3)
     parser.add_argument("--kills", type=int, default=30, help="workers killed")
     parser.add_argument("--pause", type=float, default=25.0, help="mean seconds between two kills")
+    parser.add_argument("--megabytes", type=int, default=10_000, help="on the disk, of the recording for info")
     parser.add_argument("--keep", type=Path, help="file of the rows of parts that ended")
     parser.add_argument("--write", action="store_true", help="replace the benchmark's figures")
     parser.add_argument("--seed", type=int, default=1)
@@ -59,6 +61,12 @@ def main() -> None:
                 continue
             if part == "writers":
                 two_writers(verdicts, place)
+            elif part == "overhead":
+                overhead(verdicts, s3, place)
+            elif part == "info":
+                info(verdicts, place, options.megabytes)
+            elif part == "delta":
+                delta(verdicts, place)
             else:
                 nights(verdicts, s3, place, options.stores, options.nights, options.kills, options.pause, options.seed)
             verdicts.keep()
