@@ -28,7 +28,6 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-import _figures
 from _fleet_costs import delta, info, overhead
 from _fleet_faults import nights, two_writers
 from _fleet_verdicts import Verdicts
@@ -71,7 +70,7 @@ def main() -> None:
                 nights(verdicts, s3, place, options.stores, options.nights, options.kills, options.pause, options.seed)
             verdicts.keep()
     if options.write:
-        print(_figures.write("fleet", "Nights of a fleet with faults", verdicts.figures(PARTS)), file=sys.stderr)
+        print(verdicts.write(PARTS), file=sys.stderr)
     sys.exit(verdicts.failed)
 
 
