@@ -77,7 +77,7 @@ def info(verdicts: Verdicts, folder: Path, megabytes: int) -> None:
     needed = sum(_covered(asked, start, length) for start, length in decoded.items())
     print(f"# {found.messages} messages, {len(asked)} requests, {took:.0f} s", file=sys.stderr)
     verdicts.row(
-        f"`info` of {size / 1e9:.1f} GB in a bucket reads < {MOST_INFO / 1e6:.0f} MB besides its start check's chunks",
+        f"`info` of {size / 1e9:.1f} GB reads < {MOST_INFO / 1e6:.0f} MB besides the start check",
         bool(decoded) and read - needed < MOST_INFO and found.bytes == size,
         f"{(read - needed) / 1e6:.2f} MB, and {len(decoded)} chunks of {needed / 1e6:.2f} MB",
     )  # fmt: skip
@@ -146,7 +146,7 @@ def delta(verdicts: Verdicts, folder: Path) -> None:
     (whole, size), *nights = fetched
     most, keyframes = max(nights)
     verdicts.row(
-        f"a night's difference, one aisle of {AISLES} visited, is < {MOST_DELTA / 1e6:.0f} MB", most < MOST_DELTA,
+        f"a night in one aisle of {AISLES}: < {MOST_DELTA / 1e6:.0f} MB to fetch", most < MOST_DELTA,
         f"{most / 1e6:.2f} MB of {keyframes} keyframes; the store {whole / 1e6:.2f} MB of {size}",
     )  # fmt: skip
 
@@ -213,10 +213,10 @@ def overhead(verdicts: Verdicts, s3: Server, folder: Path) -> None:
         cluster.shutdown()
     plain, plain_clock, fleet, fleet_clock = (sum(column) for column in zip(*spent, strict=True))
     verdicts.row(
-        f"`fleet run` takes <= {100 * MOST_OVERHEAD:.0f} % more processor time than `map update` and `map plan`",
+        f"overhead over `map update` and `map plan` <= {100 * MOST_OVERHEAD:.0f} %",
         fleet <= (1 + MOST_OVERHEAD) * plain,
-        f"{100 * (fleet / plain - 1):+.0f} % for {PAIRS * WALKS} recordings ({fleet:.0f} and {plain:.0f} s;"
-        f" by the clock {fleet_clock:.0f} and {plain_clock:.0f} s)",
+        f"{100 * (fleet / plain - 1):+.0f} %: {fleet:.0f} and {plain:.0f} s of processor,"
+        f" by the clock {fleet_clock:.0f} and {plain_clock:.0f} s",
     )  # fmt: skip
 
 

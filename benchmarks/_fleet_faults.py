@@ -198,15 +198,18 @@ def nights(
         killer.close()
         cluster.shutdown()
     verdicts.row(
-        f"{stores} stores x {count} nights: {killer.killed} workers and {count} drivers killed, the storage held for"
-        f" {HELD_S:.0f} s, {100 * FAILING:.0f} % of its answers fail", code == 0 and killer.killed == kills,
+        f"{stores} stores x {count} nights: {killer.killed} workers and {count} drivers killed, storage held for"
+        f" {HELD_S:.0f} s, {100 * FAILING:.0f} % failing answers", code == 0 and killer.killed == kills,
         f"{fault_s:.0f} s, {drivers + 1} drivers",
     )  # fmt: skip
-    verdicts.row(
-        "an upload that was cut off stops no other walk", cut[0] == 3 and cut[1].endswith(", 2 failed"), cut[1]
-    )
-    verdicts.row("a run that has nothing to do does nothing", again[0] == 0 and " 0 of " in again[1], again[1])
+    verdicts.row("a cut-off upload stops no other walk", cut[0] == 3 and cut[1].endswith(", 2 failed"), _jobs(cut[1]))
+    verdicts.row("one more run does nothing", again[0] == 0 and " 0 of " in again[1], _jobs(again[1]))
     check(verdicts, chain, folder)
+
+
+def _jobs(text: str) -> str:
+    """How many were done, of what `fleet run` printed."""
+    return text.rpartition(": ")[2]
 
 
 def check(verdicts: Verdicts, chain: Chain, folder: Path) -> None:
@@ -224,7 +227,7 @@ def check(verdicts: Verdicts, chain: Chain, folder: Path) -> None:
     walks, different = (int(number) for number in rows.split(","))
     verdicts.row(
         "a catalogue row for each walk", (walks, different) == (count * (len(names) + 1), count * len(names)),
-        f"{walks}, of which {walks - different} were sent twice",
+        f"{walks}, {walks - different} sent twice",
     )  # fmt: skip
     versions = history(chain.root / names[-1] / "map")
     most = max(delta_bytes(new, old) for new, old in itertools.pairwise(versions))

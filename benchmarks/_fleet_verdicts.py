@@ -68,4 +68,4 @@ class Verdicts:
             holds = "yes" if row.holds else "no"
             figures += [Figure(row.sentence, "measured", row.figure), Figure(row.sentence, "holds", holds)]
         made = dict.fromkeys(self._commits[part] for part in parts if part in self._commits)
-        return write("fleet", "Nights of a fleet with faults", figures, made=", ".join(made))
+        return write("fleet", "Nights of a fleet with faults", figures, at=", ".join(made))
