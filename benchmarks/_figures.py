@@ -65,8 +65,8 @@ def processor() -> str:
     return f"{names[0]}, {len(names)} cores" if names else platform.machine()
 
 
-def write(name: str, title: str, figures: Sequence[Figure], folder: Path = FOLDER) -> Path:
-    """Replace the figures of the benchmark `name`, which ran with this checkout on this machine.
+def write(name: str, title: str, figures: Sequence[Figure], folder: Path = FOLDER, at: str = "") -> Path:
+    """Replace the figures of the benchmark `name`, which ran on this machine with this checkout or that of `at`.
 
     Returns:
         The file.
@@ -74,7 +74,7 @@ def write(name: str, title: str, figures: Sequence[Figure], folder: Path = FOLDE
     made: dict[str, Any] = {
         "title": title,
         "command": f"python -m benchmarks {name}",
-        "commit": commit(),
+        "commit": at or commit(),
         "date": datetime.now(UTC).date().isoformat(),
         "machine": processor(),
         "versions": {"python": platform.python_version()} | {one: version(one) for one in VERSIONS},

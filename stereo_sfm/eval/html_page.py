@@ -10,6 +10,7 @@ from pathlib import Path
 STYLE = """
 body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222;background:#fff}
 table{border-collapse:collapse;margin:.6em 0}td,th{padding:.15em .8em;border-bottom:1px solid #ddd;text-align:left}
+td.word{white-space:nowrap}td.right,th.right{text-align:right;white-space:nowrap}
 figure{margin:1em 0;border:1px solid #ddd}figure svg{width:100%;height:auto;cursor:grab;touch-action:none}
 figcaption{padding:.2em .6em;color:#666}code{background:#f2f2f2}img{max-width:100%}
 """
@@ -30,6 +31,7 @@ for (const svg of document.querySelectorAll("figure svg")) {
   svg.addEventListener("dblclick", () => set(...home));
 }
 """
+LONG_WORD = 40  # letters, from which on a word may be broken
 HINT = "Plots: the wheel zooms, the mouse moves, a double click shows all."
 
 
@@ -85,9 +87,18 @@ def _blocks(markdown: str, plots: dict[str, str]) -> Iterator[str]:
 
 def _table(lines: list[str]) -> str:
     rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line.strip().strip("|"))] for line in lines]
-    head = "".join(f"<th>{_inline(cell)}</th>" for cell in rows[0])
-    body = "".join(f"<tr>{''.join(f'<td>{_inline(cell)}</td>' for cell in row)}</tr>" for row in rows[2:])
+    right = [cell.endswith("-:") for cell in rows[1]]
+    head = "".join(_cell("th", cell, of) for cell, of in zip(rows[0], right, strict=False))
+    body = "".join(
+        f"<tr>{''.join(_cell('td', cell, of) for cell, of in zip(row, right, strict=False))}</tr>" for row in rows[2:]
+    )
     return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _cell(tag: str, text: str, right: bool) -> str:
+    """A browser would break a date at its hyphens."""
+    kind = "right" if right else "word" if "-" in text and " " not in text and len(text) < LONG_WORD else ""
+    return f"<{tag}{f' class={kind}' if kind else ''}>{_inline(text)}</{tag}>"
 
 
 def _inline(text: str) -> str:

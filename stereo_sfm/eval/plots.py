@@ -186,21 +186,23 @@ def _seconds(record: RunRecord) -> F64:
 
 
 def plot_trends(path: Path, columns: Sequence[str], rows: Sequence[Sequence[float | str | None]]) -> None:
-    """Numbers of a fleet by night, one panel each.
+    """Numbers of a fleet by night, one panel each, two beside each other.
 
     Args:
         path: of the picture. columns: "night" first. rows: one of each night, None for a missing value.
     """
-    nights = [str(row[0]) for row in rows]
-    figure = Figure(figsize=(9, 2 * (len(columns) - 1)))
+    nights = [str(row[0])[5:] for row in rows]  # month and day
+    count = len(columns) - 1
+    lines = (count + 1) // 2
+    figure = Figure(figsize=(11, 2 * lines))
     for k, name in enumerate(columns[1:]):
-        axes = figure.add_subplot(len(columns) - 1, 1, k + 1)
+        axes = figure.add_subplot(lines, 2, k + 1)
         values = [np.nan if row[k + 1] is None else float(row[k + 1] or 0.0) for row in rows]
         axes.plot(range(len(nights)), values, ".-")
-        axes.set_ylabel(name)
-        axes.set_ylim(bottom=0)
+        axes.set_title(name, fontsize="medium", loc="left")
+        axes.set_ylim(0, 1.1 * np.nanmax([*values, 1e-9]))  # 0 at the bottom also where all are 0 or missing
         axes.grid(alpha=0.3)
-        shown = range(0, len(nights), max(len(nights) // 8, 1))
-        axes.set_xticks(list(shown), [nights[i] for i in shown] if k == len(columns) - 2 else ["" for _ in shown])
+        shown = range(0, len(nights), max(-(-len(nights) // 8), 1))
+        axes.set_xticks(list(shown), [nights[i] for i in shown] if k >= count - 2 else ["" for _ in shown])
     figure.tight_layout()
     _save(figure, path)

@@ -39,9 +39,10 @@ FROM turned GROUP BY robot, camera ORDER BY 7 DESC, robot
 FAILED = "SELECT store, night, robot, walk, why FROM walks WHERE NOT ok ORDER BY night DESC, store, walk"
 CHANGED = "SELECT store, night, version, text FROM changes ORDER BY night DESC, store, text"
 TRENDS = """
-SELECT w.night, count(*) AS walks, count(*) FILTER (NOT ok) AS failed, median(lost_percent) AS lost,
-       median(drift_percent) AS drift, sum(w.cost_s) / 3600 AS hours,
-       (SELECT median(delta) / 1e6 FROM versions v WHERE v.night = w.night) AS delta
+SELECT w.night, count(*) AS walks, count(*) FILTER (NOT ok) AS "walks in no map",
+       median(lost_percent) AS "lost, median, %", median(drift_percent) AS "drift at loops, median, %",
+       sum(w.cost_s) / 3600 AS "core-hours",
+       (SELECT median(delta) / 1e6 FROM versions v WHERE v.night = w.night) AS "difference of a map, median, MB"
 FROM walks w GROUP BY w.night ORDER BY w.night
 """
 MOST_SHOWN = 50  # rows of a table on the page; the files hold all
@@ -105,5 +106,14 @@ def _table(connection: Any, query: str) -> tuple[list[str], list[tuple[Any, ...]
 
 
 def _markdown(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> list[str]:
-    shown = [["" if cell is None else str(cell).replace("|", "/") for cell in row] for row in rows]
-    return [f"| {' | '.join(row)} |" for row in (columns, ["---"] * len(columns), *shown)]
+    """Numbers stand to the right, with as many decimals as the longest of their column."""
+    shown = list(zip(*(_texts(column) for column in zip(*rows, strict=True)), strict=True))
+    numbers = [all(isinstance(cell, int | float | None) for cell in column) for column in zip(*rows, strict=True)]
+    rule = ["---:" if number else "---" for number in numbers]
+    return [f"| {' | '.join(row)} |" for row in (columns, rule, *shown)]
+
+
+def _texts(column: Sequence[Any]) -> list[str]:
+    places = max((len(str(cell).partition(".")[2]) for cell in column if isinstance(cell, float)), default=0)
+    numbers = [f"{cell + 0.0:.{places}f}" if isinstance(cell, float) else cell for cell in column]  # -0.0 is 0
+    return ["" if cell is None else str(cell).replace("|", "/") for cell in numbers]

@@ -262,9 +262,9 @@ def _describe_source(out: Description, spec: str | Path, rig: Path | None) -> No
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
         broken, unlit = _unseen(source, len(stamps))
-        out.problems += [*broken, *(unlit or _against_calibration(source))]
-        lengths = unchecked_lengths(source.rig, source)
+        lengths = unchecked_lengths(source.rig, source)  # of the first images, which are at hand now
         out.calibration += [lengths] if lengths else []
+        out.problems += [*broken, *(unlit or _against_calibration(source))]
     out.problems += _problems(out)
 
 

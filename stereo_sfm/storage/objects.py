@@ -118,13 +118,13 @@ def _named(remote: Remote, doing: str, error: BaseException, obx: Any) -> Stereo
         return StereoSfmError(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
     if isinstance(error, FileNotFoundError | obx.NotFoundError):
         return Missing(f"there is no {remote}")
+    if FULL.search(said):  # before the rights: some servers answer 403 to what exceeds a limit
+        return StereoSfmError(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
     denied = (PermissionError, obx.PermissionDeniedError, obx.UnauthenticatedError)
     if isinstance(error, denied) or DENIED.search(said):
         return StereoSfmError(
             f"no right to {doing} {remote}: check the credentials in the environment, and the rights of this prefix"
         )
-    if FULL.search(said):
-        return StereoSfmError(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
     if "credential" in said.lower() or "169.254.169.254" in said:
         return StereoSfmError(f"no credentials for {remote.scheme}://: set them in the environment (AWS_ACCESS_KEY_ID)")
     code = CODE.search(said)

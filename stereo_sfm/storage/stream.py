@@ -9,7 +9,7 @@ from stereo_sfm.storage import objects
 from stereo_sfm.storage.remote import Remote
 
 PAGE = 1 << 16  # bytes: the least that is asked for, besides `ranges`
-MOST_AHEAD = 32  # pages asked for beyond what is read in order: 2 MiB hide 50 ms of latency at 40 MB/s
+MOST_AHEAD = 32  # pages of a request that reads ahead in order: 2 MiB hide 50 ms of latency at 40 MB/s
 KEPT = 512  # pages, 32 MiB: the index and the first images, which `info` reads several times
 NEAR = 4  # pages left out that still count as in order: the message index between two chunks of a recording
 
@@ -27,7 +27,7 @@ class RangeStream(io.BufferedIOBase):  # raw ones are wrapped by readers, and cl
         self._size, self.tag = objects.size_and_tag(remote)
         self._at = 0
         self._pages: OrderedDict[int, bytes] = OrderedDict()
-        self._next, self._ahead = 0, 0  # the page after the last request, and how many were asked for beyond the need
+        self._next, self._ahead = 0, 0  # the page after the last request, and how many one asks for in order
         self.received = 0
 
     def readable(self) -> bool:
@@ -61,7 +61,9 @@ class RangeStream(io.BufferedIOBase):  # raw ones are wrapped by readers, and cl
         if missing:
             in_order = self._next <= missing[0] <= self._next + NEAR
             self._ahead = min(2 * self._ahead + 1, MOST_AHEAD) if in_order else 0
-            begin, until = missing[0], missing[-1] + 1 + (self._ahead if missing[-1] == end - 1 else 0)
+            begin, until = missing[0], missing[-1] + 1
+            if until == end:
+                until = max(until, begin + self._ahead)  # a large request needs nothing beyond itself
             length = min(until * PAGE, self._size) - begin * PAGE
             raw = objects.read_range(self.remote, begin * PAGE, length)
             self.received += length

@@ -118,6 +118,12 @@ def test_markdown_is_escaped_and_formatted() -> None:
     assert "gone" not in page
 
 
+def test_numbers_stand_to_the_right_and_dates_are_not_broken() -> None:
+    page = to_html("t", "| night | n | text |\n|---|---:|---|\n| 2026-11-25 | 2 | it-is two |", {})
+    for part in ("<td class=word>2026-11-25</td>", "<td class=right>2</td>", "<td>it-is two</td>", "<th class=right>n"):
+        assert part in page
+
+
 def test_tables_have_empty_cells_for_what_is_missing(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     write_table(tmp_path / "t", ("name", "n", "x"), [["a", 1, float("nan")], ["b", None, 0.1 + 0.2], ["", 3, None]])

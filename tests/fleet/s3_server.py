@@ -1,9 +1,9 @@
 """An S3 server for tests: moto's, which keeps objects in memory, in a process of its own.
 
-    python -m tests.fleet.s3_server [--fail 0.1] [--most BYTES] [--seed 1]
+    python -m tests.fleet.s3_server [--seed 1]
 
 prints its port. It adds what moto lacks: conditional puts are atomic (a lock), a part of the answers is 503 (before the
-request is carried out, or after it, so that the answer alone is lost), a bucket is full, keys are checked.
+request is carried out, or after it, so that the answer alone is lost), buckets are full, keys are checked.
 """
 
 from __future__ import annotations
@@ -19,30 +19,38 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qsl, urlencode
 
 ROOT = Path(__file__).parents[2]
 KEY, READER = "the-key", "reads-only"  # the second one may not write
 BUCKET = "fleet"
+FULL = {  # what servers answer where a limit is reached
+    "ceph": ("403 Forbidden", "QuotaExceeded"),
+    "minio": ("507 Insufficient Storage", "XMinioStorageFull"),
+    "minio bucket": ("400 Bad Request", "XMinioAdminBucketQuotaExceeded"),
+}
 
 
 class Faulty:
     """A WSGI application around moto's."""
 
-    def __init__(self, app: Any, fail: float, most: int, seed: int) -> None:
-        self._app, self._fail, self._most = app, fail, most
+    def __init__(self, app: Any, seed: int) -> None:
+        self._app, self._fail, self._full = app, 0.0, ""
         self._random, self._lock = random.Random(seed), threading.RLock()
         self._sent, self._written = 0, 0
 
     def __call__(self, environ: dict[str, Any], start: Callable[..., Any]) -> Iterable[bytes]:
         method, path = environ["REQUEST_METHOD"], environ["PATH_INFO"]
-        if path == "/-/faults":  # of the test: "?fail=0.1"
-            self._fail = float(environ["QUERY_STRING"].partition("=")[2])
+        if path == "/-/faults":  # of the test: "?fail=0.1&full=ceph"
+            asked = dict(parse_qsl(environ["QUERY_STRING"]))
+            self._fail, self._full = float(asked["fail"]), asked.get("full", "")
             return _answer(start, "200 OK", f"{self._sent} {self._written}")
         who = environ.get("HTTP_AUTHORIZATION", "")
         if f"Credential={KEY}/" not in who and (f"Credential={READER}/" not in who or method not in ("GET", "HEAD")):
             return _answer(start, "403 Forbidden", "<Error><Code>AccessDenied</Code></Error>")
-        if method == "PUT" and self._most and self._written > self._most:
-            return _answer(start, "507 Insufficient Storage", "<Error><Code>QuotaExceeded</Code></Error>")
+        if self._full and (method == "PUT" or (method == "POST" and "uploads" in environ["QUERY_STRING"])):
+            status, code = FULL[self._full]
+            return _answer(start, status, f"<Error><Code>{code}</Code></Error>")
         with self._lock:
             fails, late = self._random.random() < self._fail, self._random.random() < 0.5
         if fails and not late:
@@ -66,8 +74,6 @@ def _answer(start: Callable[..., Any], status: str, text: str) -> list[bytes]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--fail", type=float, default=0.0)
-    parser.add_argument("--most", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--port", type=int, default=0)
     options = parser.parse_args()
@@ -80,7 +86,7 @@ def main() -> None:
         def log(self, type: str, message: str, *args: Any) -> None:
             return
 
-    app = Faulty(DomainDispatcherApplication(create_backend_app), options.fail, options.most, options.seed)
+    app = Faulty(DomainDispatcherApplication(create_backend_app), options.seed)
     server = make_server("127.0.0.1", options.port, app, threaded=True, request_handler=Quiet)
     print(server.server_port, flush=True)
     server.serve_forever()
@@ -114,9 +120,10 @@ class Server:
     def make_bucket(self, name: str = BUCKET) -> None:
         self.request("PUT", f"/{name}")
 
-    def faults(self, share: float) -> tuple[int, int]:
-        """Let this share of the answers fail; returns the bytes sent and received until now."""
-        sent, received = self.request("GET", f"/-/faults?fail={share}").split()
+    def faults(self, share: float, full: str = "") -> tuple[int, int]:
+        """Let this share of the answers fail, and every write if it is full in the manner of a server of `FULL`;
+        returns the bytes sent and received until now."""
+        sent, received = self.request("GET", f"/-/faults?{urlencode({'fail': share, 'full': full})}").split()
         return int(sent), int(received)
 
     def hold(self) -> None:

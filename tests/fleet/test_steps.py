@@ -146,6 +146,7 @@ def test_the_report_names_what_failed(
     assert "1 stores, 2 nights, 2 walks, 1 of them in no map" in printed and "r2/2026-11-26_2200.mcap: " in printed
     page = (tmp_path / "page" / "fleet.html").read_text()
     assert "<svg" in page and "r2/2026-11-26_2200.mcap" in page
+    assert "<td class=word>2026-11-26</td>" in page and "<th class=right>map MB</th>" in page
     assert (tmp_path / "page" / "stores.parquet").is_file()
     assert main(["fleet", "report", str(tmp_path / "plan.toml"), "--sql", "SELEC 1"]) == StereoSfmError.exit_code
 

@@ -8,6 +8,7 @@ import pytest
 
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_folder
 from stereo_sfm.storage.objects import Missing
@@ -15,6 +16,7 @@ from stereo_sfm.storage.remote import Remote, place
 from stereo_sfm.storage.stream import PAGE, RangeStream
 from tests.fleet.s3_server import READER, Server
 from tests.fleet.writers import winners
+from tests.maps.maps import small_map
 
 
 @pytest.mark.parametrize(
@@ -121,8 +123,29 @@ def test_a_pace_is_kept(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [["info", "s5://b/x.mcap"], ["run", "s3://absent/x.mcap", "--inline"], ["map", "versions", "s3://absent/store"]],
+    [
+        ["info", "s5://b/x.mcap"],
+        ["run", "s3://absent/x.mcap", "--inline"],
+        ["map", "versions", "s3://absent/store"],
+        ["record", "sim:aisle?size=96x80&frames=2", "-o", "s3://absent/x.mcap", "-q"],
+    ],
 )
 def test_commands_say_it_in_one_line(arguments: list[str], s3: Server, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == StereoSfmError.exit_code
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_no_right_to_write_is_one_line(
+    place: str, s3: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(small_map()[1], tmp_path / "map")
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", READER)
+    objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    for arguments in (
+        ["map", "update", f"{place}/store", str(tmp_path / "map")],
+        ["record", "sim:aisle?size=96x80&frames=2", "-o", f"{place}/x.mcap", "-q"],
+        ["fleet", "upload", str(tmp_path / "map"), f"{place}/map"],
+    ):
+        assert main(arguments) == StereoSfmError.exit_code
+        said = capsys.readouterr().err.strip()
+        assert len(said.splitlines()) == 1 and "no right to write s3://" in said and READER not in said
