@@ -219,7 +219,7 @@ class Map:
 
     def _unlink(self, rows: I64) -> None:
         """Take observations out of their points' lists; the points' counts stay."""
-        table, points = self.observations, np.unique(self.observations.pt[rows])
+        table, points = self.observations, np.unique(self.observations.pt[rows]).astype(np.int64)
         obs, of = self.sightings(points)
         table.pt[rows] = -1
         obs, of = obs[stay := table.pt[obs] >= 0], of[stay]

@@ -115,8 +115,8 @@ def _inertial_factors(
     known = [map_.known_states.get(row) for row in nodes[first].tolist()]
     if not len(links) or all(state is None for state in known):
         return None
-    motions = [m for m in motions if m is not None]
-    return InertialFactors(imu, links, motions, first, known, map_.keyframes.state[nodes])
+    measured = [m for m in motions if m is not None]
+    return InertialFactors(imu, links, measured, first, known, map_.keyframes.state[nodes])
 
 
 @dataclass(eq=False)

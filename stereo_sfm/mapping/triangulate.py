@@ -40,7 +40,7 @@ def triangulate(map_: Map, rig: Rig, rows: I64) -> F64:
         """Cost (N,) of each point, and models of the observations."""
         linear, _ = problem.linearize(State(rot, pos, points))
         loss = np.log1p(linear[3] / CAUCHY**2)
-        return np.bincount(of, loss[:, 0] + loss[:, 1], count), linear
+        return np.asarray(np.bincount(of, loss[:, 0] + loss[:, 1], count), np.float64), linear
 
     first = kf[problem.starts[:-1]]
     rays = np.einsum("nij,nj->ni", rot[first], rig.left.unproject(uv_left[problem.starts[:-1]]))

@@ -39,7 +39,11 @@ class FeatureKind:
 
     def empty(self) -> U8 | F32:
         """(0, width) descriptors."""
-        return np.zeros((0, self.width), np.uint8 if self.norm == cv2.NORM_HAMMING else np.float32)
+        return (
+            np.zeros((0, self.width), np.uint8)
+            if self.norm == cv2.NORM_HAMMING
+            else np.zeros((0, self.width), np.float32)
+        )
 
 
 # The thesis compares all of them by l2; binary descriptors are compared by Hamming distance here, as they are meant to.
