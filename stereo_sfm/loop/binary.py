@@ -1,4 +1,4 @@
-"""Compiled kernels over 256-bit binary descriptors: nearest neighbours, k-majority clustering.
+"""256-bit binary descriptors: nearest neighbours, k-majority clustering.
 
 A row of zeros means that no descriptor could be computed and matches nothing.
 """
@@ -47,43 +47,15 @@ def _two_nearest(a, b, group):
     return best, first, second
 
 
-@njit
-def _majority(words, members, k, assignment):
-    """Bitwise majority of each of k clusters over rows `members` of words; empty clusters stay zero."""
-    votes = np.zeros((k, BITS), np.int32)
-    sizes = np.zeros(k, np.int32)
-    for n in range(members.shape[0]):
-        c = assignment[n]
-        sizes[c] += 1
-        for w in range(4):
-            x = words[members[n], w]
-            for b in range(64):
-                votes[c, w * 64 + b] += np.int32((x >> np.uint64(b)) & np.uint64(1))
-    centres = np.zeros((k, 4), np.uint64)
-    for c in range(k):
-        for w in range(4):
-            x = np.uint64(0)
-            for b in range(64):
-                if 2 * votes[c, w * 64 + b] > sizes[c]:
-                    x |= np.uint64(1) << np.uint64(b)
-            centres[c, w] = x
-    return centres, sizes
+def _distances(words: U64, centres: U64) -> I64:
+    """(N, 4) and (k, 4) -> (k, N) differing bits."""
+    return np.array([np.bitwise_count(words ^ centre).sum(1, dtype=np.int64) for centre in centres])
 
 
-@njit
-def _assign(words, members, centres):
-    """Nearest centre of each member and the distance to it; ties go to the lower centre."""
-    out = np.empty(members.shape[0], np.int32)
-    distance = np.empty(members.shape[0], np.int32)
-    for n in range(members.shape[0]):
-        low = BITS + 1
-        for c in range(centres.shape[0]):
-            d = hamming(words, members[n], centres, c)
-            if d < low:
-                low = d
-                out[n] = c
-        distance[n] = low
-    return out, distance
+def _majorities(words: U64, assignment: I64) -> U64:
+    """(c, 4) bitwise majority of each cluster of rows of words (N, 4) that has any; a tie gives zero."""
+    bits = [np.unpackbits(words[assignment == c].view(np.uint8), axis=1) for c in np.unique(assignment)]
+    return as_words(np.array([np.packbits(2 * b.sum(0, dtype=np.int64) > len(b)) for b in bits]))
 
 
 @njit
@@ -114,22 +86,22 @@ def k_majority(words: U64, members: I32, k: int, rng: np.random.Generator, round
     Returns:
         (c, 4) centres and (n,) the centre of each member.
     """
-    centres = words[members[[int(rng.integers(len(members)))]]]
-    _, distance = _assign(words, members, centres)
+    words = words[members]
+    centres = words[[int(rng.integers(len(words)))]]
+    distance = _distances(words, centres)[0]
     while len(centres) < k:  # k-means++ seeding: the next centre with probability proportional to squared distance
         weight = distance.astype(float) ** 2
         total = weight.sum()
         if total == 0:
             break
         pick = int(np.searchsorted(np.cumsum(weight), rng.random() * total, side="right"))
-        new = words[members[[min(pick, len(members) - 1)]]]
+        new = words[[min(pick, len(words) - 1)]]
         centres = np.concatenate([centres, new])
-        distance = np.minimum(distance, _assign(words, members, new)[1])
-    assignment, _ = _assign(words, members, centres)
+        distance = np.minimum(distance, _distances(words, new)[0])
+    assignment = _distances(words, centres).argmin(0)  # ties go to the lower centre
     for _ in range(rounds):
-        centres, sizes = _majority(words, members, len(centres), assignment)
-        centres = centres[sizes > 0]
-        updated, _ = _assign(words, members, centres)
+        centres = _majorities(words, assignment)
+        updated = _distances(words, centres).argmin(0)
         if np.array_equal(updated, assignment):
             break
         assignment = updated

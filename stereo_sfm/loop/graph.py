@@ -228,14 +228,12 @@ class KeyframeGraph:
         ends = np.concatenate([np.stack([linked, linked + 1], 1), np.searchsorted(rows, loops)])
         metres = np.zeros(len(ends))
         metres[: len(linked)] = nodes.distance[rows[linked + 1]] - nodes.distance[rows[linked]]
-        best = _shortest_of_each_pair(ends, metres)
         start, goal = np.searchsorted(rows, (self._row(a), self._row(b))).tolist()
-        path = _shortest_path(len(rows), ends[best], metres[best], start, goal)
+        path = _shortest_path(ends, metres, len(rows), start, goal)
         if path is None:
             return None
         a_T_b, total = np.eye(4), 0.0
-        for edge, forward in path:
-            k = int(best[edge])
+        for k, forward in path:
             p, q = rows[ends[k]]
             odometry = se3.inverse(nodes.odom_T_cam[p]) @ nodes.odom_T_cam[q] if k < len(linked) else None
             p_T_q = self._loops.a_T_b[k - len(linked)] if odometry is None else odometry
@@ -254,29 +252,26 @@ def _newest_between(a: I64, b: I64) -> Bool:
     return (a != b) & (later < NEWEST // 2)
 
 
-def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:
-    """Rows of the edges (E, 2) that are the shortest between their nodes; the first of equals."""
-    low, high = ends.min(1), ends.max(1)
-    order = np.lexsort((np.arange(len(ends)), metres, high, low))
-    new = np.ones(len(order), bool)
-    new[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
-    return order[new & (low[order] != high[order])].astype(np.int64)
+def _shortest_path(ends: I64, metres: F64, count: int, start: int, goal: int) -> list[tuple[int, bool]] | None:
+    """Rows of the edges (E, 2) from start to goal, each with whether it is traversed from its first end to its second.
 
-
-def _shortest_path(count: int, ends: I64, metres: F64, start: int, goal: int) -> list[tuple[int, bool]] | None:
-    """Edges from start to goal, each with whether it is traversed from its first end to its second."""
+    Of edges between the same nodes the shortest counts, of equals the first.
+    """
     if start == goal:
         return []
-    graph = scipy.sparse.coo_array((metres + HOP_METRES, (ends[:, 0], ends[:, 1])), shape=(count, count)).tocsr()
+    shortest: dict[tuple[int, int], int] = {}
+    for k in np.argsort(metres, kind="stable").tolist():
+        shortest.setdefault((int(ends[k].min()), int(ends[k].max())), k)
+    pairs = sorted(shortest)
+    lengths = metres[[shortest[pair] for pair in pairs]] + HOP_METRES
+    graph = scipy.sparse.coo_array((lengths, np.array(pairs).reshape(-1, 2).T), shape=(count, count)).tocsr()
     distance, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):
         return None
-    keys = ends.min(1) * count + ends.max(1)  # unique
-    order = np.argsort(keys)
     path: list[tuple[int, bool]] = []
     while goal != start:
         last = int(before[goal])
-        edge = int(order[np.searchsorted(keys, min(last, goal) * count + max(last, goal), sorter=order)])
+        edge = shortest[min(last, goal), max(last, goal)]
         path.append((edge, int(ends[edge, 0]) == last))
         goal = last
     return path[::-1]
