@@ -18,7 +18,7 @@ from stereo_sfm.types import F64, Keyframe
 
 NEWEST_KEYFRAMES = 12  # searched: where a camera can be after a short loss
 NEAREST = 2  # keyframes that are matched, of the most similar views, and others whose points are added to each one's
-WINDOWS = 0.05, 0.12, 0.3  # radius of the search, as shares of the image's width
+WINDOWS = 0.05, 0.12, 0.3, 1.0  # radius of the search, as shares of the image's width
 MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners: a hypothesis, which tracking verifies
 
 
@@ -48,14 +48,15 @@ class RecentPlaces:
         Args:
             keyframe: what the camera sees; its pose is not used.
             expected: (4, 4) odom_T_cam; corners are searched for around their projections from there, in growing
-                windows.
+                windows; at last anywhere, for who has turned by more than a window.
         """
         view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
         clouds = [(k, self._around(k)) for k in self._order(expected)[:NEAREST]]
         for share in WINDOWS:
             for centre, cloud in clouds:
                 rng = np.random.default_rng([self._config.seed, keyframe.frame_id, centre.kf_id])
-                b_T_a = self._match(se3.inverse(expected) @ centre.odom_T_cam, view, cloud, share, rng)
+                start = se3.inverse(expected) @ centre.odom_T_cam if share < 1.0 else np.eye(4)
+                b_T_a = self._match(start, view, cloud, share, rng)
                 if b_T_a is not None:
                     yield se3.orthonormalize(centre.odom_T_cam @ se3.inverse(b_T_a))
 
