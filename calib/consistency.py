@@ -21,7 +21,7 @@ import numpy as np
 
 from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
 from stereo_sfm.calib.choice import Estimate
-from stereo_sfm.calib.elimination import Eliminated, point_noise, robust_weights
+from stereo_sfm.calib.elimination import OUTLIER_SIGMAS, Eliminated, point_noise, robust_weights
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import (
     DIRECTION,
@@ -198,7 +198,8 @@ def _fit(rig: Rig, problems: list[Problem], lens: Lens, vector: F64, sigma: floa
         for problem in problems:
             residual, by_point, by_rest = linearised(current, problem, vector)
             sizes.append(point_noise(residual))
-            problem.weight = robust_weights(residual, 3 * sigma, 6 * sigma if iteration >= iterations // 2 else np.inf)
+            most = OUTLIER_SIGMAS * sigma if iteration >= iterations // 2 else np.inf
+            problem.weight = robust_weights(residual, 3 * sigma, most)
             weight = problem.weight / (CORRELATED * sigma) ** 2
             solved = Eliminated.of(residual, by_point, by_rest, weight, SHARED)
             hessian, gradient = hessian + solved.matrix, gradient + solved.gradient

@@ -15,6 +15,8 @@ from stereo_sfm.calib.scene_model import tangents
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
+OUTLIER_SIGMAS = 6.0  # beyond which a point at a moment does not count once the first steps are done
+
 
 class OwnUnknowns(Protocol):
     """What a window alone has."""

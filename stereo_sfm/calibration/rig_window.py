@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
-from stereo_sfm.calib.elimination import Eliminated, point_noise, robust_weights
+from stereo_sfm.calib.elimination import OUTLIER_SIGMAS, Eliminated, point_noise, robust_weights
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
 from stereo_sfm.geometry import se3
@@ -30,7 +30,6 @@ from stereo_sfm.types import F64, I64, RIG_TERMS, Bool, Keyframe
 MIN_POINTS, MAX_POINTS = 20, 160
 STEPS = 4  # of Gauss-Newton: two that find what does not fit, two without it
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandths of a pixel
-OUTLIER_SIGMAS = 6.0  # beyond which a point at a moment does not count in the later steps
 NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit
 LENSES = slice(5, 8)  # focal ratio and decentering
 LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these

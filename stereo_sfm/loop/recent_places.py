@@ -18,7 +18,8 @@ from stereo_sfm.types import F64, Keyframe
 
 NEWEST_KEYFRAMES = 12  # searched: where a camera can be after a short loss
 NEAREST = 2  # keyframes that are matched, of the most similar views, and others whose points are added to each one's
-WINDOWS = 0.05, 0.12, 0.3, 1.0  # radius of the search, as shares of the image's width
+# Radius of the search, as shares of the image's width. The last is the whole image, whatever is expected.
+WINDOWS = 0.05, 0.12, 0.3, 1.0
 MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners: a hypothesis, which tracking verifies
 
 
@@ -55,7 +56,7 @@ class RecentPlaces:
         for share in WINDOWS:
             for centre, cloud in clouds:
                 rng = np.random.default_rng([self._config.seed, keyframe.frame_id, centre.kf_id])
-                start = se3.inverse(expected) @ centre.odom_T_cam if share < 1.0 else np.eye(4)
+                start = se3.inverse(expected) @ centre.odom_T_cam if share < WINDOWS[-1] else np.eye(4)
                 b_T_a = self._match(start, view, cloud, share, rng)
                 if b_T_a is not None:
                     yield se3.orthonormalize(centre.odom_T_cam @ se3.inverse(b_T_a))

@@ -98,7 +98,7 @@ class _Prior:
     cost: float
 
 
-class Table:
+class _Table:
     """Observations of the moving or of the fixed keyframes, sorted by point, in columns for the kernels."""
 
     def __init__(self, rigs: Sequence[Rig], bundle: Bundle, config: BundleConfig, rows: I64) -> None:
@@ -115,8 +115,8 @@ class Table:
         for rig, own in zip(rigs, of_rig, strict=True):
             seen[own, 1] &= rig.stereo
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
-        self.weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
-        self._columns = kernels.Rows(self.kf, self.pt, left, right, self.weights)
+        self._weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
+        self._columns = kernels.Rows(self.kf, self.pt, left, right, self._weights)
         self._rigs = [(own, StereoCameras.of_any(rig)) for rig, own in zip(rigs, of_rig, strict=True)]
         self.trust = np.ones(len(bundle.points))  # (P,) factor of the loss of the points' disparities
         self.use = seen.copy()  # (M, 2) images that count
@@ -124,7 +124,7 @@ class Table:
         self.cauchy = 0.0  # above 0: `linearize` uses Cauchy's loss of this scale in sigmas
         self.limit = 0.0  # above 0: the next `linearize` determines which images count
 
-    def linearize(self, state: State) -> tuple[Linear, float]:
+    def linearize(self, state: _State) -> tuple[Linear, float]:
         """Quadratic models of the observations at a state, and their robust cost."""
         n, cost = len(self.kf), 0.0
         out: Linear = (np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2)))
@@ -137,7 +137,7 @@ class Table:
         self.limit = 0.0
         return out, float(cost)
 
-    def add_disparity_errors(self, state: State, total: F64, information: F64) -> None:
+    def add_disparity_errors(self, state: _State, total: F64, information: F64) -> None:
         """Add the weighted disparity errors of the points' observations, and their weights, to (P,) and (P,)."""
         for own, cameras in self._rigs:
             kernels.add_disparity_errors(
@@ -152,10 +152,10 @@ class Table:
 
     def agreeing(self, chi2: F64, limit: float) -> Bool:
         """(M, 2) which images agree, whether or not they counted."""
-        return (self.weights > 0) & (chi2 <= limit)
+        return (self._weights > 0) & (chi2 <= limit)
 
 
-class State:
+class _State:
     """Poses and points, the quadratic model of the moving keyframes' observations, and the cost."""
 
     def __init__(self, rot: F64, pos: F64, points: F64) -> None:
@@ -173,8 +173,8 @@ class _Solver:
         two_cameras = any(rig.second_camera is not None for rig in rigs)
         self._weighs_disparities = config.disparity_sigmas > 0 and two_cameras
         moves = ~bundle.fixed[bundle.obs_kf]
-        self.table = Table(rigs, bundle, config, np.flatnonzero(moves))
-        self.fixed = Table(rigs, bundle, config, np.flatnonzero(~moves))
+        self.table = _Table(rigs, bundle, config, np.flatnonzero(moves))
+        self.fixed = _Table(rigs, bundle, config, np.flatnonzero(~moves))
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
         self.points_stay = bundle.points_stay
@@ -186,26 +186,26 @@ class _Solver:
         n = len(bundle.points)
         self._nothing = _Prior(bundle.points, np.zeros((n, 6)), np.zeros((n, 3)), 0.0)
 
-    def _prior(self, state: State) -> _Prior:
+    def _prior(self, state: _State) -> _Prior:
         if not len(self.fixed.kf):
             return self._nothing
         lin, cost = self.fixed.linearize(state)
         return _Prior(state.points, *self.fixed.sum_up(state.rot, lin), cost)
 
-    def evaluate(self, state: State, prior: _Prior | None = None) -> State:
+    def evaluate(self, state: _State, prior: _Prior | None = None) -> _State:
         """Fill in the model and the cost; `prior`: model of the fixed keyframes from an earlier state, to reuse it."""
         self._evaluate_images(state, prior)
         self._evaluate_sensors(state)
         return state
 
-    def _evaluate_images(self, state: State, prior: _Prior | None = None) -> None:
+    def _evaluate_images(self, state: _State, prior: _Prior | None = None) -> None:
         state.lin, state.cost = self.table.linearize(state)
         state.prior = prior or self._prior(state)
         state.cost += state.prior.cost
         if prior is not None and prior is not self._nothing:
             state.cost += kernels.prior_cost(state.points, prior.x0, prior.h, prior.g)
 
-    def _evaluate_sensors(self, state: State) -> None:
+    def _evaluate_sensors(self, state: _State) -> None:
         """Add gravity and motions."""
         if self.level is not None:
             expected, weight, cost = self.level.evaluate(state.rot, self.moving)
@@ -215,14 +215,14 @@ class _Solver:
             state.pull, cost = self.model.evaluate(state.rot[self.moving], state.pos[self.moving])
             state.cost += cost
 
-    def _weigh_disparities(self, state: State) -> None:
+    def _weigh_disparities(self, state: _State) -> None:
         """Give less weight to the disparities of points whose mean error is large, see `_disparity_weights`."""
         total, information = np.zeros(len(state.points)), np.zeros(len(state.points))
         for table in (self.table, self.fixed):
             table.add_disparity_errors(state, total, information)
         self.table.trust = self.fixed.trust = _disparity_weights(total, information, self.config.disparity_sigmas)
 
-    def begin_round(self, state: State, judge: bool) -> None:
+    def begin_round(self, state: _State, judge: bool) -> None:
         """Linearise anew without outliers; `judge`: determine outliers, in all rounds but the first."""
         if judge and self._weighs_disparities:  # not at the start, where wrong poses make all points disagree
             self._weigh_disparities(state)
@@ -239,7 +239,7 @@ class _Solver:
                 self.model = self.motions.linearized(state.rot, state.pos, self.free, judge).scaled(self.share)
             self._evaluate_sensors(state)
 
-    def _pose_system(self, state: State, damping: float) -> tuple[F64, F64]:
+    def _pose_system(self, state: _State, damping: float) -> tuple[F64, F64]:
         h, b = np.zeros((len(self.moving), 6, 6)), np.zeros((len(self.moving), 6))
         kernels.pose_blocks(self.table.kf, self.free, state.lin, h, b)
         if self.level is not None:
@@ -252,7 +252,7 @@ class _Solver:
         diagonal += damping * diagonal + 1e-12
         return h, b
 
-    def _solve_poses(self, state: State, damping: float, blocks: tuple[F64, F64] | None) -> F64 | None:
+    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64] | None) -> F64 | None:
         h, b = self._pose_system(state, damping)
         if blocks is None:  # nothing couples the poses
             xi, factor = np.zeros(b.shape), np.zeros((6, 6))
@@ -271,14 +271,14 @@ class _Solver:
         )
         return self.system.solve(matrix, b)
 
-    def _point_blocks(self, state: State, damping: float) -> tuple[F64, F64]:
+    def _point_blocks(self, state: _State, damping: float) -> tuple[F64, F64]:
         """Inverse blocks and right sides of the points."""
         h, g = self.table.sum_up(state.rot, state.lin)
         prior = state.prior
-        kernels.point_blocks(state.points, prior.x0, prior.h, prior.g, np.full(len(h), damping), h, g)
+        kernels.point_blocks(state.points, prior.x0, prior.h, prior.g, damping, h, g)
         return h, g
 
-    def step(self, state: State, damping: float) -> State | None:
+    def step(self, state: _State, damping: float) -> _State | None:
         """The state after one damped step, or None if the system has no solution."""
         rot, pos, points = state.rot, state.pos, state.points
         blocks = None if self.points_stay else self._point_blocks(state, damping)
@@ -293,9 +293,9 @@ class _Solver:
             points, table = np.empty_like(points), self.table
             view = table.starts, table.kf, self.free, state.rot, state.lin
             kernels.point_steps(*view, *blocks, xi, state.points, points)
-        return self.evaluate(State(rot, pos, points), state.prior if self.config.fixed_once else None)
+        return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
-    def _extended(self, state: State, trial: State) -> State:
+    def _extended(self, state: _State, trial: _State) -> _State:
         """The best of ever longer steps from one state towards another, which has a lower cost.
 
         The weights of a redescending loss follow a step only afterwards, so that where keyframes move together each
@@ -306,13 +306,13 @@ class _Solver:
         while factor <= LONGEST_STEP:
             rot = np.ascontiguousarray(state.rot @ se3.so3_exp(factor * turn))
             pos, points = (a + factor * (b - a) for a, b in ((state.pos, trial.pos), (state.points, trial.points)))
-            further = self.evaluate(State(rot, pos, points), prior)
+            further = self.evaluate(_State(rot, pos, points), prior)
             if not further.cost < best.cost:
                 break
             best, factor = further, 2.0 * factor
         return best
 
-    def descend(self, state: State) -> tuple[State, int, bool]:
+    def descend(self, state: _State) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt from one state: the best state, accepted steps, whether it converged."""
         damping, accepted, c = self.config.damping, 0, self.config
         while accepted < c.iterations:
@@ -396,7 +396,7 @@ def bundle_adjust(rig: Rig | Sequence[Rig], bundle: Bundle, config: BundleConfig
     config = config or BundleConfig()
     _check(bundle)
     solver = _Solver([rig] if isinstance(rig, Rig) else rig, bundle, config)
-    state = State(
+    state = _State(
         np.ascontiguousarray(bundle.world_T_kf[:, :3, :3], float),
         np.ascontiguousarray(bundle.world_T_kf[:, :3, 3], float),
         np.ascontiguousarray(bundle.points, float),
@@ -411,7 +411,7 @@ def bundle_adjust(rig: Rig | Sequence[Rig], bundle: Bundle, config: BundleConfig
 
 
 def _result(
-    solver: _Solver, bundle: Bundle, state: State, initial: float, iterations: int, converged: bool
+    solver: _Solver, bundle: Bundle, state: _State, initial: float, iterations: int, converged: bool
 ) -> BundleResult:
     inlier, chi2 = np.empty((len(bundle.obs_kf), 2), bool), np.empty((len(bundle.obs_kf), 2))
     for table, found in ((solver.table, state.lin[3]), (solver.fixed, solver.fixed.linearize(state)[0][3])):

@@ -289,7 +289,7 @@ def point_blocks(points, x0, q, prior_g, damping, h, g):
     Both are zero for a point whose block is singular: nothing sees it.
 
     Args:
-        x0, q, prior_g: the priors' (P, 3), H (P, 6) and g (P, 3). damping: (P,).
+        x0, q, prior_g: the priors' (P, 3), H (P, 6) and g (P, 3).
     """
     for i in range(points.shape[0]):
         d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]
@@ -300,9 +300,9 @@ def point_blocks(points, x0, q, prior_g, damping, h, g):
         h00, h01, h02 = h[i, 0] + q0, h[i, 1] + q1, h[i, 2] + q2
         h11, h12, h22 = h[i, 3] + q3, h[i, 4] + q4, h[i, 5] + q5
         scale = (h00 + h11 + h22) / 3.0
-        h00 += damping[i] * h00
-        h11 += damping[i] * h11
-        h22 += damping[i] * h22
+        h00 += damping * h00
+        h11 += damping * h11
+        h22 += damping * h22
         c00 = h11 * h22 - h12 * h12
         c01 = h02 * h12 - h01 * h22
         c02 = h01 * h12 - h02 * h11

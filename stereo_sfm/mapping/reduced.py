@@ -57,7 +57,7 @@ class ReducedSystem:
         return blocks
 
     def solve(self, blocks: F64, b: F64) -> F64 | None:
-        """(F, 6) step, or None where the matrix is not positive definite."""
+        """(F, 6) step; None where the dense matrix is not positive definite, or the sparse one singular."""
         return self._solve_dense(blocks, b) if self.dense else self._solve_sparse(blocks, b)
 
     def _solve_sparse(self, blocks: F64, b: F64) -> F64 | None:

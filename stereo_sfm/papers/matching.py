@@ -30,8 +30,8 @@ def match_features(first: Features, second: Features, norm: int, ratio: float) -
     (best, second_best), target = found[0].astype(float).T, found[1][:, 0]
     passed = np.flatnonzero(best < ratio * second_best)
     passed = passed[np.lexsort((passed, best[passed], target[passed]))]  # by target, then distance, then source
-    chosen = passed[np.unique(target[passed], return_index=True)[1]]
-    return np.stack([chosen := np.sort(chosen), target[chosen]], 1).astype(np.int64)
+    chosen = np.sort(passed[np.unique(target[passed], return_index=True)[1]])
+    return np.stack([chosen, target[chosen]], 1).astype(np.int64)
 
 
 def epipolar_inliers(bearings0: F64, bearings1: F64, threshold: float, rng: np.random.Generator) -> Bool:

@@ -30,8 +30,11 @@ class PointIds:
         return np.array([self._follow(i) for i in ids.tolist()], np.int64)
 
     def _follow(self, point: int) -> int:
-        while point in self._replaced:  # never in a circle: what was replaced is in the map no more
-            point = self._replaced[point]
+        for _ in range(len(self._replaced) + 1):
+            replaced = self._replaced.get(point)
+            if replaced is None:
+                return point
+            point = replaced
         return point
 
     def inherit(self, view: FeatureView, reference: FeatureView, rows: I64) -> FeatureView:

@@ -68,6 +68,8 @@ def window_curvatures(slots, rays, origin, points, warp, last, new, model, param
             and of the new one. model, params: of the lens. out: (N, 6) 1/px, q; zero where it is not known.
     """
     base, normal, at, second = np.zeros(3), np.zeros(3), np.zeros((2, len(OFFSETS))), np.zeros((2, 3))
+    centre, right, left, down, up = at[:, 0], at[:, 1], at[:, 2], at[:, 3], at[:, 4]
+    both, neither = at[:, 5], at[:, 6]
     to_last, to_new = last.T.copy(), new.T.copy()  # the first three rows turn odometry axes, and move nothing
     for row in range(slots.shape[0]):
         k, q = slots[row], out[row]
@@ -89,11 +91,11 @@ def window_curvatures(slots, rays, origin, points, warp, last, new, model, param
             p = project_one(model, params, x, y, z)
             at[0, n], at[1, n] = p[0], p[1]
         for i in range(2):
-            across, along = at[i, 1] + at[i, 2], at[i, 3] + at[i, 4]
-            second[i, 0], second[i, 2] = across - 2 * at[i, 0], along - 2 * at[i, 0]
-            second[i, 1] = 0.5 * (at[i, 5] + at[i, 6] + 2 * at[i, 0] - across - along)
-        a, b = at[0, 1] - at[0, 2], at[0, 3] - at[0, 4]  # the affine part, times 2 STEP
-        c, d = at[1, 1] - at[1, 2], at[1, 3] - at[1, 4]
+            across, along = right[i] + left[i], down[i] + up[i]
+            second[i, 0], second[i, 2] = across - 2 * centre[i], along - 2 * centre[i]
+            second[i, 1] = 0.5 * (both[i] + neither[i] + 2 * centre[i] - across - along)
+        a, b = right[0] - left[0], down[0] - up[0]  # the affine part, times 2 STEP
+        c, d = right[1] - left[1], down[1] - up[1]
         scale, largest = 2 / ((a * d - b * c) * STEP), 0.0
         for n in range(3):
             q[n] = scale * (d * second[0, n] - b * second[1, n])
