@@ -242,13 +242,13 @@ RULES = (
     _rule(
         "noise of a match",
         STEREO,
-        "np.maximum(off / config.max_window_difference_sigmas, sigma_px / config.max_window_sigmas) / self._sigma_px",
-        "off / config.max_window_difference_sigmas / self._sigma_px",
+        "np.maximum(off / EDGE_DIFFERENCE, sigma_px / EDGE_SIGMAS) / self._sigma_px",
+        "off / EDGE_DIFFERENCE / self._sigma_px",
     ),
     _rule(
         "residual of a plane",
         STEREO,
-        "failed = np.maximum(failed, misfit / (config.max_surface_misfit * typical))",
+        "failed = np.maximum(failed, misfit / (EDGE_MISFIT * typical))",
         "pass",
     ),
     _rule(

@@ -37,16 +37,21 @@ RENAMED = {
 
 # Settings of earlier versions that decide nothing any more -> what does.
 REMOVED = {
-    "tracker.max_window_disparity_px": "tracker.max_window_difference_sigmas decides",
+    "tracker.max_window_disparity_px": "the noise of the windows decides",
+    "tracker.max_window_difference_sigmas": "it is 1.5",
+    "tracker.max_window_sigmas": "it is 1.8",
+    "tracker.max_surface_misfit": "it is eight times the typical one",
     "tracker.depth_sigma_px": "it is ten times tracker.sigma_px",
     "features.motion_window_deg": "matches may move by any angle",
     "odometry.unit_step_m": "a step of unknown length is one metre long",
     "odometry.keyframe_rescue_inliers": "it is three quarters of odometry.keyframe_min_inliers",
     "odometry.init_epipolar_px": "it is twice odometry.epipolar_px",
     "odometry.init_parallax_deg": "it is one degree",
+    "manhattan.settle_frames": "there are ten",
     "manhattan.gate_deg": "it is twenty times manhattan.model_sigma_deg",
     "mapper.disparity_sigmas": "it is twice mapper.huber_sigmas",
     "mapper.rounds": "there are two",
+    "mapper.match_min": "it is four fifths of mapper.connected_points",
     "mapper.match_sigma_px": "it is 2.5 times mapper.sigma_px",
     "mapper.near_keyframes": "there are as many as two views keep",
     "mapper.near_depths": "it is twice what keyframes of one view are apart",
@@ -57,6 +62,8 @@ REMOVED = {
     "loop.connected_points": "it is half of loop.min_inliers",
     "loop.side_inliers": "it is 1.5 times loop.min_inliers",
     "loop.side_cells": "it is three quarters of loop.min_cells",
+    "loop.relocalize_candidates": "there are 16",
+    "loop.relocalize_keyframes": "there are six",
     "loop.relocalize_cells": "it is three quarters of loop.min_cells",
     "loop.disparity_sigma": "it is half of loop.sigma_px",
     "loop.disparity_sigma_px": "it is half of loop.sigma_px",
@@ -99,15 +106,6 @@ class TrackerConfig:
         0.01,
         100,
         "Distance of a stereo match from its epipolar curve, before the sequence has shown its own scatter",
-    )
-    max_window_difference_sigmas: float = number(
-        1.5, 0, 1000, "Difference of two windows' disparities over the typical noise of one: more is an edge in depth"
-    )
-    max_window_sigmas: float = number(
-        1.8, 0, 1000, "Noise of a window's disparity over the typical one: more is an edge in depth"
-    )
-    max_surface_misfit: float = number(
-        8.0, 1, 1000, "Difference of matched windows over the typical one: more is an edge in depth"
     )
     keyframe_share: float = number(0.75, 0, 1, "New keyframe when a smaller share of the last one's points is left")
     keyframe_max_frames: int = number(30, 1, 100_000, "Frames that a keyframe represents at most")
@@ -188,7 +186,6 @@ class ManhattanConfig:
     every: int = number(
         15, 1, 10_000_000, "Frames between measurements; one costs as much time as tracking several frames"
     )
-    settle_frames: int = number(10, 1, 100_000, "Measurements that must agree before the axes are accepted")
     model_sigma_deg: float = number(
         0.15, 1e-6, 90, "Standard deviation of the building's edges from the three directions"
     )
@@ -231,7 +228,6 @@ class MapperConfig:
     match_radius_px: float = number(10.0, 0, 10_000, "Search radius around the predicted pixel, in both images")
     match_distance_bits: int = number(50, 0, 256, "Largest distance of descriptors")
     match_ratio: float = number(0.85, 0.01, 1, "Best distance below this share of the second best")
-    match_min: int = number(12, 0, 100_000, "Consistent matches below which none is used")
     max_error_sigmas: float = number(3.0, 0, 1000, "Mean error of a point's observations above which it is culled")
     min_parallax_deg: float = number(0.1, 0, 90, "Largest angle between a point's rays below which it is too uncertain")
     redundant_share: float = number(
@@ -249,6 +245,11 @@ class MapperConfig:
     def disparity_sigmas(self) -> float:
         """Mean error of a point's stereo matches beyond which they count less (depth edges); 0: never."""
         return 2.0 * self.huber_sigmas
+
+    @property
+    def match_min(self) -> int:
+        """Consistent matches below which none is used: a few points fewer than connect two keyframes."""
+        return 4 * self.connected_points // 5
 
     @property
     def match_sigma_px(self) -> float:
@@ -301,8 +302,6 @@ class LoopConfig:
     consistent: int = number(2, 1, 1000, "Keyframes, among twice as many, that must agree on a loop")
     gate_m: float = number(0.3, 0, 1e6, "Distance by which a loop may contradict odometry; it doubles in 30 m")
     gate_deg: float = number(3.0, 0, 360, "Angle by which a loop may contradict odometry; it doubles in 10 m")
-    relocalize_candidates: int = number(16, 1, 10_000, "Places of a saved map that are verified for an image")
-    relocalize_keyframes: int = number(6, 1, 1000, "Keyframes whose points form a place")
     relocalize_inliers: int = number(56, 1, 100_000, "Corners that must agree with the pose found in a saved map")
     relocalize_share: float = number(
         0.25, 0, 1, "The same as a share of the camera's corners (near a guess: min_inlier_share)"

@@ -124,8 +124,8 @@ def test_every_earlier_name_leads_to_a_setting() -> None:
 
 
 def test_settings_are_few() -> None:
-    """What can be derived from another setting, or what nobody needs to change, is none. Six are of live depth."""
-    assert sum("range" in field.metadata for _, field, _ in SETTINGS) <= 80 + 6
+    """What can be derived from another setting, or what nobody needs to change, is none."""
+    assert sum("range" in field.metadata for _, field, _ in SETTINGS) <= 80
 
 
 def test_an_explained_configuration_has_every_sentence_and_is_read_back() -> None:

@@ -35,7 +35,9 @@ from stereo_sfm.types import F64, I64, Keyframe
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: lamps and products repeat at larger steps
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
 MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
-SIDE_PLACES = 12  # of `relocalize_candidates` that are verified beside: no confident one ends that search
+# Places that are verified for an image, and those beside, where no confident one ends the search.
+PLACES, SIDE_PLACES = 16, 12
+PLACE_KEYFRAMES = 6  # whose points form a place
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
 
@@ -280,7 +282,7 @@ class Relocalizer:
         shared = self._shared(row)
         shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
-        order = np.argsort(-shared, kind="stable")[: self.config.relocalize_keyframes]
+        order = np.argsort(-shared, kind="stable")[:PLACE_KEYFRAMES]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
         own = [self._own[k] for k in order.tolist()]
@@ -305,7 +307,7 @@ class Relocalizer:
         together[self._described] = with_neighbours(scores[self._described])
         best = np.argsort(-together, kind="stable")
         scored = best[np.logical_and.accumulate(scores[best] > 0)]
-        return apart(scored.tolist(), 2, self.config.relocalize_candidates)
+        return apart(scored.tolist(), 2, PLACES)
 
     def _nearest(self, guess: F64, count: int) -> I64:
         """Rows of the nearest keyframes, nearest first."""

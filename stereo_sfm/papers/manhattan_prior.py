@@ -23,6 +23,8 @@ from stereo_sfm.papers.manhattan import measure
 from stereo_sfm.tracking.protocol import AnyTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
+SETTLED = 10  # measurements that must agree before the axes are accepted
+
 
 class RotationFilter:
     """Rotation of the camera in the odometry frame, from predicted motions and measured axes."""
@@ -72,7 +74,7 @@ class RotationFilter:
             if np.linalg.norm(se3.so3_log(self._seen[0].T @ seen)) > self._gate:
                 self._seen = []
         self._seen.append(seen)
-        if len(self._seen) < self._config.settle_frames:
+        if len(self._seen) < SETTLED:
             return
         columns = np.concatenate([axes.T for axes in self._seen])
         self._odom_R_axes = rotation_between(np.tile(np.eye(3), (len(self._seen), 1)), columns)

@@ -18,7 +18,7 @@ from stereo_sfm.presets import preset
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState, Trajectory
 from tests.synthetic import pinhole_rig
 
-CONFIG = ManhattanConfig(every=1, settle_frames=5, drift_sigma_deg_per_frame=0.02)
+CONFIG = ManhattanConfig(every=1, drift_sigma_deg_per_frame=0.02)
 WORLD_R_AXES = se3.so3_exp(np.array([0.1, -0.2, 0.3]))
 
 

@@ -24,6 +24,9 @@ SEARCH_LEVEL = 1
 BEHIND_SIGMAS = 4.0  # by which noise may put a far point behind the camera
 MIN_SIGMA_PX = 0.07  # of a disparity: least noise
 MIN_MISFIT = 0.5  # lower bound of the typical misfit, in squares of the expected noise
+# More than these is an edge in depth: the difference of two windows' disparities and the noise of one, over the typical
+# noise, and the windows' misfit over the typical one.
+EDGE_DIFFERENCE, EDGE_SIGMAS, EDGE_MISFIT = 1.5, 1.8, 8.0
 MOST_FAILED = 3.0  # times the limits of the windows' tests, where matches are few
 
 
@@ -200,11 +203,8 @@ class StereoMatcher:
             self._learn(sigma_px[tested])
         typical = max(percentile(misfit[tested], PERCENTILE), MIN_MISFIT) if tested.any() else MIN_MISFIT
         off = np.fmax(0.0 if off is None else off, np.linalg.norm(fitted - uv_right, axis=1))
-        config = self._config
-        failed = (
-            np.maximum(off / config.max_window_difference_sigmas, sigma_px / config.max_window_sigmas) / self._sigma_px
-        )
-        failed = np.maximum(failed, misfit / (config.max_surface_misfit * typical))
+        failed = np.maximum(off / EDGE_DIFFERENCE, sigma_px / EDGE_SIGMAS) / self._sigma_px
+        failed = np.maximum(failed, misfit / (EDGE_MISFIT * typical))
         failed[~(tested & self._right_area.inside(uv_right) & np.isfinite(failed))] = np.inf
         return fitted, np.maximum(sigma_px, MIN_SIGMA_PX), failed
 
