@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1] / "stereo_sfm"
-ROOMS = ("calibration", "loop", "mapping", "maps", "papers")
+ROOMS = ("calibration", "loop", "mapping", "maps", "papers", "tracking")
 FILES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
 
 

@@ -18,7 +18,7 @@ from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.tracking.flow.klt import Pyramid
 from stereo_sfm.types import F64
 
-ITERATIONS = 12
+ITERATIONS = 12  # on each level, at most: an alignment that has not ended by then does not converge
 STEP = 0.1  # pixels of the level below which a step ends its iterations
 SEARCHED = 0.25  # of the field of view: rotations to either side that are tried where no prediction holds
 SPACING_PX = 2  # of the smallest level, from one of them to the next: the alignment reaches as far

@@ -8,7 +8,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, I64, Bool, MapUpdate
 
-NEAREST_M = 1e-6
+NEAREST_M = 1e-6  # metres, from the camera: no point is in its centre
 
 
 def take_update(tracks: Tracks, update: MapUpdate, resumed_T_odom: F64) -> Tracks:

@@ -15,7 +15,7 @@ from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, within
 from stereo_sfm.types import F64
 
 MORE_RECALL = 0.15  # by which more of the reference points must be found than before
-LASTS_NS = 1_000_000_000
+LASTS_NS = 1_000_000_000  # in which what covers the view has gone by, or stays
 UNCERTAIN_M = 0.02  # standard deviation of a position that new points should not inherit
 CONTRADICTED_SIGMAS = 3.0  # between two positions of which one must be wrong
 

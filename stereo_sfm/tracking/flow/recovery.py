@@ -25,7 +25,7 @@ GRID = (16, 12)  # columns and rows of the image in which corners are counted: f
 SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
 RIVAL = 0.75  # share of the best recall with which another place makes the result ambiguous
-MIN_INLIERS = 16
+MIN_INLIERS = 16  # points that agree: twice the fewest that are a group
 MIN_INLIER_SHARE = 0.6  # of the points that are found
 # Recall that is needed, the rest may still be covered: for a pose that is certain, more for one with a standard
 # deviation, up to the largest, and per standard deviation between the pose and the prediction. Ceiling and floor alone,

@@ -20,7 +20,7 @@ from stereo_sfm.tracking.flow.surface import INTERPOLATION, fit_planes
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F32, F64, Bool, StereoImage
 
-SEARCH_LEVEL = 1
+SEARCH_LEVEL = 1  # of the pyramids, for matches from nowhere: the half image, whose noise averages out
 BEHIND_SIGMAS = 4.0  # by which noise may put a far point behind the camera
 MIN_SIGMA_PX = 0.07  # of a disparity: least noise
 MIN_MISFIT = 0.5  # lower bound of the typical misfit, in squares of the expected noise

@@ -15,7 +15,7 @@ from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.types import F64, U8
 
 PATCH = 4  # half size of the search patch, in pixels of the search level
-SIZE = 2 * PATCH + 1
+SIZE = 2 * PATCH + 1  # of the same, along each side
 AREA = SIZE * SIZE
 SHORT = 8  # pixels side by side, of which fewer are compared one by one
 NODES = 4  # candidates from one that is projected to the next, between which the curve is all but straight

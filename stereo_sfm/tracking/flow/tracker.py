@@ -47,10 +47,8 @@ from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
-NOT_FOUND = (
-    Tracks(),
-    PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), 0.0, 0.0, "not_found"),
-)
+# The result without points.
+NOT_FOUND = Tracks(), PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), 0.0, 0.0, "not_found")
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
 TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
 TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
@@ -62,7 +60,7 @@ ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a sha
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
 REFERENCE_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
-UNKNOWN_COVARIANCE = np.eye(6)
+UNKNOWN_COVARIANCE = np.eye(6)  # a metre and a radian: the odometry has not begun
 FOLLOWED_S = 0.5  # without a pose: with 2 m/s^2, a robot is a quarter of a metre from where it was expected
 FEW_RIGHT = 0.75  # of the share of points that had a right pixel before: they are looked for farther away ...
 RIGHT_LEVEL = 2  # ... from this level of the pyramids on

@@ -14,6 +14,7 @@ from stereo_sfm.tracking.flow.windows import FLOATS, INDEX, SIZE, STRIDE, lanes
 
 HALF = 7.5  # from the centre of a window to its first sample
 MAX_REACH = 60.0  # px from the centre of a warped window
+# Types of the generated code.
 WORD, WORDS = ir.IntType(32), ir.VectorType(ir.IntType(32), SIZE)
 
 

@@ -19,10 +19,11 @@ from numba.extending import intrinsic
 
 from stereo_sfm.geometry.kernels import inner, njit
 
-SIZE = 16
-STRIDE = SIZE + 4
+SIZE = 16  # pixels along each side: one vector register of bytes
+STRIDE = SIZE + 4  # with the extra columns, a multiple of four
 FLAT_SIZE = SIZE * STRIDE
-WIDE_SIZE = (SIZE + 2) * STRIDE
+WIDE_SIZE = (SIZE + 2) * STRIDE  # with a pixel more all around, for gradients
+# Types of the generated code.
 INDEX = ir.IntType(64)
 BYTES, FLOATS = ir.VectorType(ir.IntType(8), SIZE), ir.VectorType(ir.FloatType(), SIZE)
 

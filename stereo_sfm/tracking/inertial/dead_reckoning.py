@@ -22,6 +22,7 @@ from stereo_sfm.geometry.preintegration import Preintegrated
 from stereo_sfm.tracking.inertial.inertial_filter import InertialState
 from stereo_sfm.types import F64
 
+# Rows of the errors of position, velocity, rotation, gravity, both biases, and what the wheels do not know.
 P, V, R, G, BA, BG, S = (slice(a, b) for a, b in ((0, 3), (3, 6), (6, 9), (9, 12), (12, 15), (15, 18), (18, 22)))
 DOUBTED_CHI2, SLIPS_CHI2 = 11.3, 50.0  # of three degrees of freedom: from 99 % on it counts less, then not at all
 
