@@ -15,6 +15,7 @@ from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.allocator import Release, return_large_blocks, share_one_heap
+from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.service.camera import patient
 from stereo_sfm.service.commands import Commands
@@ -139,6 +140,7 @@ class Service(Commands):
         return {**stages, **{name: pid for name, pid in others.items() if pid is not None}}
 
     def _run_pipelines(self) -> None:
+        raise_priority()  # the recorder and the outputs, which clients keep busy, were started before
         try:
             self._pipelines.run()
         except StereoSfmError as error:
