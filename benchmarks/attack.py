@@ -38,6 +38,7 @@ STOP_S = 5.0
 MOST_MB = 600  # of a command that reads a hostile file
 HANG_S = 300.0  # by the clock: the computer may be busy, and a command has fifty seconds of processor time
 BEARER = "Bearer "
+TRACEBACK, MOST_SHOWN = "Traceback", 4000  # characters of one
 DEMO = ROOT / "recordings" / "demo.mcap"
 
 WRITER = """
@@ -474,7 +475,10 @@ def main() -> int:
         seconds = time.monotonic() - begin
         saved = (target.folder / "store" / "map.json").exists()
         report("SIGTERM afterwards", f"{seconds:.1f} s, map saved: {saved}", seconds <= STOP_S and saved)
-    report("the service's log", f"{target.said.count('Traceback')} tracebacks", "Traceback" not in target.said)
+    found = target.said.count(TRACEBACK)
+    report("the service's log", f"{found} tracebacks", not found)
+    for text in target.said.split(TRACEBACK)[1:]:
+        print(f"{TRACEBACK}{text[:MOST_SHOWN]}")
     return sum(not closed for _, _, closed in rows)
 
 
