@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -418,7 +418,7 @@ def _free_port() -> int:
 
 
 @contextmanager
-def running(requests: int, folder: Path | None = None) -> Iterator[Target]:
+def running(requests: int, folder: Path | None = None) -> Generator[Target]:
     """A service that plays the bundled recording again and again. Args: folder, of its map, which it continues."""
     with ExitStack() as beside:
         folder = folder or Path(beside.enter_context(tempfile.TemporaryDirectory(prefix="attack")))

@@ -6,7 +6,7 @@ import json
 import logging
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -30,7 +30,7 @@ COUNT = 2000
 @contextmanager
 def _no_failure_of_ours(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> Iterator[list[Any]]:
+) -> Generator[list[Any]]:
     """Nothing is printed or logged as an error, and the guard needs its last resort for nothing but bad numbers."""
     failures: list[Any] = []
     monkeypatch.setattr(guard.Guard, "_report", lambda self, scope, error: failures.append((scope["path"], error)))

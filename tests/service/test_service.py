@@ -34,7 +34,7 @@ def wait_for(what: Callable[[], object]) -> None:
 
 def config(tmp_path: Path, mode: str = "extend", every_min: float = 5.0) -> RobotConfig:
     return RobotConfig(
-        map=MapConfig(str(tmp_path / "store"), mode, every_min),
+        map=MapConfig(str(tmp_path / "store"), mode, save_every_min=every_min),
         recording=RecordingConfig(folder=str(tmp_path / "recordings")),
     )
 
