@@ -128,13 +128,16 @@ def ready(
     to_main.send(Ready(stage))
 
 
-def raise_priority() -> None:
+def raise_priority(stage: str = "") -> None:
     """Let this thread, and the processes and threads that it starts, go before others of the computer (`RAISED`).
 
     Root may do that, and who has such a limit (`LimitNICE`); for others nothing changes.
+
+    Args: stage, which gives way to the poses as this one does.
     """
     with contextlib.suppress(OSError, AttributeError):
-        os.setpriority(os.PRIO_PROCESS, 0, min(os.getpriority(os.PRIO_PROCESS, 0), RAISED))
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        os.setpriority(os.PRIO_PROCESS, 0, min(own, RAISED) + NICENESS.get(stage, 0))
 
 
 def lower_priority(stage: str) -> None:

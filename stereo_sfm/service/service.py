@@ -90,6 +90,7 @@ class Service(Commands):
         self._listener = Listener("service", self._publish_line)
         self._over = threading.Event()  # no more poses come
         self._recorded = threading.Event()  # the recording is closed
+        self._saved = threading.Event()  # the map is written
         self._ended = threading.Event()  # everything is written
         self.error: StereoSfmError | None = None  # why it ended by itself
         self._failure = ""  # of the last check that failed
@@ -152,6 +153,7 @@ class Service(Commands):
         finally:
             self._over.set()
             self._maps.finish(self._pipelines.stopped_s + END_S, self._pipelines.map_complete)
+            self._saved.set()
             self._recorded.wait()
             self._ended.set()
 
@@ -165,7 +167,7 @@ class Service(Commands):
 
     def _keep_checking(self) -> None:
         tidy = Release(RELEASE_CHECKS)
-        while not self._ended.wait(CHECK_S) and self._pipelines.stopping_s < OUTPUTS_S:
+        while not self._saved.wait(CHECK_S) and self._pipelines.stopping_s < OUTPUTS_S:
             self._check()
             tidy.step()
         self._check()  # once more: the outputs get the final state
