@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -38,6 +38,7 @@ STOP_S = 5.0
 MOST_MB = 600  # of a command that reads a hostile file
 HANG_S = 300.0  # by the clock: the computer may be busy, and a command has fifty seconds of processor time
 BEARER = "Bearer "
+TRACEBACK, MOST_SHOWN = "Traceback", 4000  # characters of one
 DEMO = ROOT / "recordings" / "demo.mcap"
 
 WRITER = """
@@ -316,7 +317,7 @@ def group_signal(t: Target) -> Outcome:
             command = [sys.executable, "-m", "stereo_sfm.cli", "serve", str(DEMO), *_settings(other)]
             process = subprocess.Popen(
                 command, env=_environment(other.folder), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                start_new_session=True,
+                process_group=0,
             )  # fmt: skip
             until = time.monotonic() + START_S
             while len(_group(process.pid)) <= count and process.poll() is None and time.monotonic() < until:
@@ -349,7 +350,7 @@ def stopped_processes(t: Target) -> Outcome:
                 process = subprocess.Popen(
                     [sys.executable, "-m", "stereo_sfm.cli", "run", str(DEMO), "--speed", "0.5", "-o", f"{name}/run"],
                     env=_environment(Path(name)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-                    start_new_session=True,
+                    process_group=0,
                 )  # fmt: skip
                 until = time.monotonic() + START_S
                 while len(_group(process.pid)) <= k + 3 and process.poll() is None and time.monotonic() < until:
@@ -417,10 +418,11 @@ def _free_port() -> int:
 
 
 @contextmanager
-def running(requests: int) -> Iterator[Target]:
-    """A service that plays the bundled recording again and again."""
-    with tempfile.TemporaryDirectory(prefix="attack") as name:
-        folder = Path(name)
+def running(requests: int, folder: Path | None = None) -> Generator[Target]:
+    """A service that plays the bundled recording again and again. Args: folder, of its map, which it continues."""
+    with ExitStack() as beside:
+        folder = folder or Path(beside.enter_context(tempfile.TemporaryDirectory(prefix="attack")))
+        folder.mkdir(exist_ok=True)
         target = Target(folder, _free_port(), _free_port(), _free_port(), requests, None)  # type: ignore[arg-type]
         source = str(DEMO)
         with (folder.with_name(f"{folder.name}.log")).open("w+") as log:
@@ -449,6 +451,7 @@ def main() -> int:
     parser.add_argument("--requests", type=int, default=2000, metavar="N", help="hostile requests")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside it")
     args = parser.parse_args()
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup a service would ignore it, as it should
     rows: list[tuple[str, str, bool]] = []
 
     def report(name: str, what: str, closed: bool) -> None:
@@ -472,7 +475,10 @@ def main() -> int:
         seconds = time.monotonic() - begin
         saved = (target.folder / "store" / "map.json").exists()
         report("SIGTERM afterwards", f"{seconds:.1f} s, map saved: {saved}", seconds <= STOP_S and saved)
-    report("the service's log", f"{target.said.count('Traceback')} tracebacks", "Traceback" not in target.said)
+    found = target.said.count(TRACEBACK)
+    report("the service's log", f"{found} tracebacks", not found)
+    for text in target.said.split(TRACEBACK)[1:]:
+        print(f"{TRACEBACK}{text[:MOST_SHOWN]}")
     return sum(not closed for _, _, closed in rows)
 
 

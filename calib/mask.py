@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.pixels import decode_gray
 from stereo_sfm.types import Bool
 
@@ -27,7 +28,7 @@ def read_mask(path: Path) -> Bool:
         StereoSfmError: the file cannot be read or is no image.
     """
     try:
-        return decode_gray(path.read_bytes()) > 0
+        return decode_gray(read_bytes(path)) > 0
     except OSError as error:
         raise StereoSfmError(f"cannot read the mask {path}: {error.strerror}") from None
     except ValueError as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 from stereo_sfm.calib.coverage import is_new
 from stereo_sfm.calib.targets import Detection, Target
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.pixels import SUFFIXES
 from stereo_sfm.types import U8, StereoImage
 
@@ -46,7 +47,7 @@ def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
         images: list[U8] = []
         for path in paths:
             try:
-                image = eight_bits(decode_gray(path.read_bytes()))
+                image = eight_bits(decode_gray(read_bytes(path)))
             except (OSError, ValueError):
                 raise StereoSfmError(f"cannot read the image {path}: remove it, or export it again") from None
             found = (image.shape[1], image.shape[0])

@@ -16,6 +16,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.pixels import decode, decode_gray, eight_bits
 from stereo_sfm.types import F32, U8, U16, ImuSamples, StereoImage, Trajectory
 
@@ -47,7 +48,7 @@ def read_gray(path: Path) -> U8 | U16:
         UnreadableImage: missing, or not decodable.
     """
     try:
-        return decode_gray(path.read_bytes())
+        return decode_gray(read_bytes(path))
     except OSError:
         raise UnreadableImage(str(path)) from None
     except ValueError as error:
@@ -65,7 +66,7 @@ def read_depth(path: Path, scale: float) -> F32:
         UnreadableImage: missing, or not decodable.
     """
     try:
-        image = decode(path.read_bytes(), cv2.IMREAD_UNCHANGED)
+        image = decode(read_bytes(path), cv2.IMREAD_UNCHANGED)
     except (OSError, ValueError):
         raise UnreadableImage(str(path)) from None
     if image.ndim != 2:

@@ -9,6 +9,7 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.input_file import read_text
 from stereo_sfm.types import F64, I64, Trajectory
 
 # Columns of the quaternion's x y z w, after the stamp and the position.
@@ -38,7 +39,7 @@ def _rows(path: Path, least: int, alone: bool = False) -> list[list[str]]:
     `alone`: rows may have a stamp and a position without a quaternion, if all rows do.
     """
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = read_text(path).splitlines()
     except FileNotFoundError:
         raise StereoSfmError(f"no trajectory at {path}") from None
     except (UnicodeDecodeError, IsADirectoryError):

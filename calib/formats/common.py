@@ -14,6 +14,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan, Tilted
+from stereo_sfm.input_file import open_regular
 from stereo_sfm.types import F64
 
 MAX_FILE_BYTES = 4 << 20
@@ -44,7 +45,7 @@ def read_text(path: Path) -> str:
     Raises:
         ValueError: larger than any calibration, or not text.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         raw = file.read(MAX_FILE_BYTES + 1)
     if len(raw) > MAX_FILE_BYTES:
         raise ValueError(f"larger than {MAX_FILE_BYTES >> 20} MiB, which no calibration is")

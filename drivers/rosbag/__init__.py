@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.drivers.driver import Certainty, Driver
 from stereo_sfm.drivers.mcap import RECORDING, McapOptions
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
@@ -44,7 +45,7 @@ def _recognise(path: Path) -> Certainty:
     if not about.is_file():
         ours = (path / RECORDING).is_file()
         return Certainty.NO if ours or not _files(path) else Certainty.LAYOUT
-    with about.open("rb") as file:
+    with open_regular(about) as file:
         return Certainty.MARKED if _MARK.encode() in file.read(_MARK_BYTES) else Certainty.NO
 
 

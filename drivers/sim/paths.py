@@ -12,6 +12,7 @@ from stereo_sfm.drivers.ground_truth import read_trajectory
 from stereo_sfm.drivers.sim.drives import FORWARD
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.input_file import read_text
 from stereo_sfm.types import F64, Trajectory
 
 STEP_M = 0.1  # least distance between positions from which a direction is taken
@@ -46,7 +47,7 @@ def read_paths(file: Path) -> list[RobotPath]:
         StereoSfmError: no such file, or not a trajectory.
     """
     file = file.expanduser()
-    text = file.read_text("utf-8-sig") if file.is_file() else ""
+    text = read_text(file) if file.is_file() else ""
     if _SESSION not in text:
         return [robot_path(read_trajectory(file))]
     return [_session(file, part) for part in text.split(_SESSION)[1:]]

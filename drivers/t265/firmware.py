@@ -15,6 +15,7 @@ from pathlib import Path
 
 from stereo_sfm.drivers.live.errors import FirmwareMissing
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 
 VERSION = "0.2.0.951"
 SIZE = 9_323_648
@@ -72,7 +73,7 @@ def find(path: str | Path | None = None) -> Path:
 def load(path: str | Path | None = None) -> Firmware:
     """Find, read and verify the firmware."""
     found = find(path)
-    return verified(found.read_bytes(), what=str(found))
+    return verified(read_bytes(found), what=str(found))
 
 
 # ---- extraction
@@ -101,7 +102,7 @@ def extract(source: Path, accepted: frozenset[str] = OFFICIAL) -> Firmware:
 
 def _members(source: Path) -> list[bytes]:
     if not zipfile.is_zipfile(source):
-        return [source.read_bytes()]
+        return [read_bytes(source)]
     with zipfile.ZipFile(source) as wheel:
         names = [n for n in wheel.namelist() if ".so" in n or n.endswith((".pyd", ".dll", ".dylib", ".mvcmd"))]
         return [wheel.read(n) for n in names]

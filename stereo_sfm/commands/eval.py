@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_text
 
 if TYPE_CHECKING:
     from stereo_sfm.eval.evaluate import Evaluation
@@ -215,7 +216,7 @@ def _pose_frame(path: Path) -> str:
     if path.suffix != ".kitti" or not stats.is_file():
         return ""
     try:
-        return json.loads(stats.read_text("utf-8-sig")).get("frame", "")
+        return json.loads(read_text(stats)).get("frame", "")
     except (ValueError, AttributeError):  # damaged
         return ""
 

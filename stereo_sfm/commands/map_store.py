@@ -150,6 +150,7 @@ def _undo(store: Path) -> int:
 
 
 def _versions(store: Path) -> int:
+    from stereo_sfm.input_file import read_text
     from stereo_sfm.maps.header import read_header
     from stereo_sfm.maps.store import CHANGES, read_about, versions, versions_folder
 
@@ -160,7 +161,7 @@ def _versions(store: Path) -> int:
         head = read_header(folder, ())
         print(f"version {number}: {head['sessions']} sessions, {head['keyframes']} keyframes, {head['points']} points")
         path = folder / CHANGES
-        lines = path.read_text("utf-8").splitlines() if path.is_file() else []
+        lines = read_text(path).splitlines() if path.is_file() else []
         print("".join(f"  {line}\n" for line in lines), end="")
     return 0
 

@@ -28,6 +28,7 @@ from stereo_sfm.dense.volume import SIDE, Seen, contributes, cubes_of, fuse, tou
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import MODELS
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.maps.floor import HIGH, LOW, find_floor
 from stereo_sfm.types import F64, U8, Bool
 
@@ -285,7 +286,7 @@ def _read(path: Path, key: str | None) -> dict[str, Any] | None:
     `key`: of what it should be made of; None: of anything.
     """
     try:
-        data = read_arrays(path.read_bytes())
+        data = read_arrays(read_bytes(path))
         return data if key is None or str(data["key"]) == key else None
     except (OSError, ValueError, KeyError):
         return None

@@ -24,6 +24,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.statistics import stage_times
+from stereo_sfm.input_file import read_text
 from stereo_sfm.presets import preset
 from stereo_sfm.types import Trajectory
 
@@ -187,7 +188,7 @@ def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[
 def load_result(path: Path) -> dict[str, Any] | None:
     """A finished cell's file, or None where there is none or it was cut off."""
     try:
-        data = json.loads(path.read_text("utf-8-sig"))
+        data = json.loads(read_text(path))
     except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
         return None
     return data if data.get("schema") == _SCHEMA else None

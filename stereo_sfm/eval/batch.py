@@ -17,6 +17,7 @@ from typing import Any
 from stereo_sfm.config import Config, dump
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.tables import write_table
+from stereo_sfm.input_file import read_text
 from stereo_sfm.jobs import Job, Limits, run_jobs
 
 RESULT = "result.json"
@@ -88,7 +89,7 @@ def finished(task: BatchTask) -> dict[str, Any] | None:
     """The result of an earlier batch with the same recording and configuration, if it went well."""
     path = Path(task.folder) / RESULT
     try:
-        result = json.loads(path.read_text("utf-8-sig"))
+        result = json.loads(read_text(path))
     except (OSError, ValueError):
         return None
     same = result.get("ok") and result.get("recording") == task.spec and result.get("config") == dump(task.config)

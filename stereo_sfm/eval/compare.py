@@ -14,6 +14,7 @@ from stereo_sfm.eval import plots
 from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
 from stereo_sfm.eval.html_page import take_plots, to_html
 from stereo_sfm.eval.tables import write_table
+from stereo_sfm.input_file import read_text
 from stereo_sfm.types import Trajectory
 
 COLUMNS = (
@@ -47,7 +48,7 @@ def stats_of(folder: Path) -> dict[str, Any]:
         StereoSfmError: not the folder of a run.
     """
     try:
-        return json.loads((folder / "stats.json").read_text("utf-8"))
+        return json.loads(read_text(folder / "stats.json"))
     except (OSError, ValueError):
         raise StereoSfmError(f"{folder} is not the folder of a run: its stats.json cannot be read") from None
 
@@ -125,7 +126,7 @@ def changed_settings(folders: Sequence[Path]) -> list[list[str]]:
 def _settings(path: Path) -> dict[str, str]:
     """Values as text by dotted name."""
     try:
-        tree = tomllib.loads(path.read_text("utf-8"))
+        tree = tomllib.loads(read_text(path))
     except (OSError, ValueError):
         raise StereoSfmError(f"{path} cannot be read: is this the folder of a run?") from None
     found: dict[str, str] = {}

@@ -13,6 +13,8 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan, description
+from stereo_sfm.input_file import read_bytes, read_text
+from stereo_sfm.pixels import decode
 from stereo_sfm.types import U8, Bool
 
 DRAWING, ABOUT, MASK = "keepout.png", "keepout.yaml", "keepout_mask"
@@ -32,14 +34,15 @@ def read_zones(folder: Path, plan: FloorPlan) -> Bool:
     zones = np.zeros(plan.image.shape, bool)
     if not (folder / DRAWING).is_file():
         return zones
-    drawn: Any = cv2.imread(str(folder / DRAWING), cv2.IMREAD_COLOR)
     try:
-        about: Any = yaml.safe_load((folder / ABOUT).read_text("utf-8"))
+        drawn = decode(read_bytes(folder / DRAWING), cv2.IMREAD_COLOR)
+    except (OSError, ValueError):
+        raise StereoSfmError(f"{folder / DRAWING} is not an image: remove it to begin with an empty drawing") from None
+    try:
+        about: Any = yaml.safe_load(read_text(folder / ABOUT))
         resolution, origin = float(about["resolution"]), np.array(about["origin"][:2], float)
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
         raise StereoSfmError(f"{folder / ABOUT} does not say where the drawing lies: remove {DRAWING} too") from None
-    if drawn is None:
-        raise StereoSfmError(f"{folder / DRAWING} is not an image: remove it to begin with an empty drawing")
     blue, green, red = (drawn[..., k].astype(int) for k in range(3))
     rows, columns = np.nonzero((red - np.maximum(blue, green) > STANDS_OUT)[::-1])  # the first row has the least y
     low = origin + np.column_stack([columns, rows]) * resolution - plan.origin  # metres from the plan's corner

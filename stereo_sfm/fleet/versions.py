@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet.patches import compressed, expanded, patch
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.remote import Remote
 
@@ -166,7 +167,7 @@ def publish(
     files: dict[str, StoredFile] = {}
     for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
         old = before.files.get(path.name) if before else None
-        files[path.name] = _stored(store, path.read_bytes(), old)
+        files[path.name] = _stored(store, read_bytes(path), old)
     by = secrets.token_hex(8)
     version = Version(
         head.next, before.name if before else "", files, {**(before.sessions if before else {}), **sessions},

@@ -30,7 +30,7 @@ def finish_in_place(path: Path, metadata: tuple[str, dict[str, str]] | None = No
     Returns:
         The number of messages in the finished file.
     """
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         index = build_index(stream)
     if metadata is not None:
         index.add_metadata(*metadata)

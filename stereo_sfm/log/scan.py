@@ -30,6 +30,7 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular
 from stereo_sfm.log.chunks import DAMAGE, PREFIX, records
 from stereo_sfm.log.index import Index, Span
 from stereo_sfm.storage.remote import Place
@@ -165,7 +166,7 @@ def is_closed(path: Path) -> bool:
     """Whether a file of this package has its index and end."""
     if path.stat().st_size < 2 * len(MCAP0_MAGIC):
         return False
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         return _ends_well(stream)
 
 

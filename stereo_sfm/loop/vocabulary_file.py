@@ -10,6 +10,7 @@ import numpy as np
 from stereo_sfm.arrays import read_arrays
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.loop.vocabulary import Vocabulary
 
 VERSION = 1  # of the file's format
@@ -31,7 +32,7 @@ def load_vocabulary(path: Path) -> Vocabulary:
     """
     again = "train one with 'stereo-sfm vocabulary train'"
     try:
-        data = read_arrays(path.read_bytes())
+        data = read_arrays(read_bytes(path))
         version = int(data["version"])
         if version != VERSION:
             raise StereoSfmError(f"{path} is vocabulary version {version}, this program reads {VERSION}: {again}")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.mapping.protocol import AnyMapper
@@ -66,7 +67,7 @@ class MapFolders:
 
 def map_sha256(folder: Path) -> str:
     """Identifies a saved map: its map.json contains the checksums of all its files."""
-    return checksum((folder / "map.json").read_bytes())
+    return checksum(read_bytes(folder / "map.json"))
 
 
 def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_text
 
 # Versions of files: 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
 SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE = 3, 4, 5
@@ -46,7 +47,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
     if not path.is_file():
         raise StereoSfmError(f"no map at {folder}: there is no map.json (create one with 'run ... --map-out')")
     try:
-        head = json.loads(path.read_text("utf-8-sig"))
+        head = json.loads(read_text(path))
         version = head["version"] if head["kind"] == KIND else None
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None

@@ -110,10 +110,10 @@ def save_map(
         for name, columns in _FILES.items():
             path = draft / f"{name}.npz"
             write_arrays(path, {c: _column(saved, c) for c in columns}, compress)
-            checksums[name] = checksum(path.read_bytes())
+            checksums[name] = checksum(read_bytes(path))
         write_native(saved.rig, draft / RIG)
         (draft / CAMERAS).write_text(cameras_text(saved.cameras, saved.session_ids), encoding="utf-8")
-        checksums |= {"rig": checksum((draft / RIG).read_bytes()), "cameras": checksum((draft / CAMERAS).read_bytes())}
+        checksums |= {"rig": checksum(read_bytes(draft / RIG)), "cameras": checksum(read_bytes(draft / CAMERAS))}
         write_header(draft, _counts(saved), saved.vocabulary_id, checksums)
         for name, data in beside.items():
             (draft / name).write_bytes(data)
@@ -160,7 +160,7 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
                 data["down"], data["down_sigma"] = np.zeros((len(data["kf_ids"]), 3)), np.zeros(len(data["kf_ids"]))
             columns.update({c: data[c] for c in wanted})
         for name, file in (("rig", RIG), ("cameras", CAMERAS))[: 1 + sessions_with_cameras]:
-            if checksum((folder / file).read_bytes()) != checksums[name]:
+            if checksum(read_bytes(folder / file)) != checksums[name]:
                 raise ValueError(name)
         own = MapCamera(read_native(folder / RIG))
         cameras = read_cameras(folder / CAMERAS) if sessions_with_cameras else {}

@@ -19,7 +19,7 @@ import yaml
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import read_bytes, read_text
 from stereo_sfm.maps.floor import find_floor
 from stereo_sfm.maps.labels import Aisle, Door
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
@@ -175,7 +175,7 @@ def _extras(store: Path) -> dict[str, bytes]:
     if not store.is_dir():
         return {}
     paths = [p for p in sorted(store.iterdir()) if p.is_file() and p.name not in map_files()]
-    return {p.name: p.read_bytes() for p in paths}
+    return {p.name: read_bytes(p) for p in paths}
 
 
 def versions(store: Path) -> list[int]:
@@ -199,7 +199,7 @@ def undo(store: Path) -> int:
     folder = versions_folder(store) / f"{kept[-1]:05d}"
     beside = _extras(store)
     beside[ABOUT] = _about_text(dataclasses.replace(read_about(store), version=kept[-1]))
-    beside[CHANGES] = (folder / CHANGES).read_bytes() if (folder / CHANGES).is_file() else b""
+    beside[CHANGES] = read_bytes(folder / CHANGES) if (folder / CHANGES).is_file() else b""
     save_map(load_map(folder), store, beside)
     shutil.rmtree(folder)
     return kept[-1]

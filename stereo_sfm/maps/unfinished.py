@@ -13,6 +13,7 @@ import numpy as np
 from stereo_sfm.arrays import read_arrays
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.header import read_header
 from stereo_sfm.maps.replace_folder import replaced_folder
@@ -46,7 +47,7 @@ def load_place(folder: Path) -> LoopResult | None:
         StereoSfmError: the file is damaged.
     """
     try:
-        raw = (folder / PLACE).read_bytes()
+        raw = read_bytes(folder / PLACE)
         if not raw:
             return None
         data = read_arrays(raw)

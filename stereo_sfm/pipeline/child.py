@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import signal
@@ -29,6 +30,7 @@ from stereo_sfm.types import Applied, Trajectory
 # Beside a live camera the pose comes first: what the others take must not delay it, if all share one core.
 NICENESS = {"logger": 2, "mapper": 4, "loop": 6, "optimizer": 8, "dense": 10}
 LOWEST_PRIORITY = 19
+RAISED = -5  # of a service's poses, where the system permits it: as much as others that share the core three times over
 AT_CAMERA_RATE = "capture", "tracker"  # their arrays are of the same sizes with every image
 HELPER = "loop"  # compiles a part of what the tracker needs in a first run, before its own kernels
 UPSTREAM_LOST = 70  # exit code of a worker that ended because another one died
@@ -124,6 +126,18 @@ def ready(
             warm_up_stage(stage, setup.config, setup.rig, patient=not setup.realtime or setup.pose_first)
     then()
     to_main.send(Ready(stage))
+
+
+def raise_priority(stage: str = "") -> None:
+    """Let this thread, and the processes and threads that it starts, go before others of the computer (`RAISED`).
+
+    Root may do that, and who has such a limit (`LimitNICE`); for others nothing changes.
+
+    Args: stage, which gives way to the poses as this one does.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        os.setpriority(os.PRIO_PROCESS, 0, min(own, RAISED) + NICENESS.get(stage, 0))
 
 
 def lower_priority(stage: str) -> None:

@@ -15,6 +15,7 @@ MODULES = (
     "stereo_sfm.log.run_log",
     "stereo_sfm.loop.closer",
     "stereo_sfm.mapping.mapper",
+    "stereo_sfm.maps.growing",
     "stereo_sfm.maps.saved_map",
     "stereo_sfm.maps.unfinished",
     "stereo_sfm.pipeline.capture",

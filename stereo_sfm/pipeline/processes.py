@@ -253,11 +253,14 @@ class ProcessRun:
         """After a stop request: end the stages that do not end by themselves.
 
         A stage may take time while it works: for a map to be saved as long as it needs, for files as long
-        as it makes progress, for a live camera `END_S`, for a service whose map is written `IN_FLIGHT_S`.
+        as it makes progress, for a live camera `END_S`, for a service whose map is written `IN_FLIGHT_S`. Before the
+        first image nothing is in flight once the camera is closed.
         """
         if waited_s > STOP_GRACE_S and "capture" in self._stages.waiting:
             self._stages.processes["capture"].kill()  # it is waiting for an image
             return
+        if not self._capturing and "capture" not in self._stages.waiting:
+            self._end_now()
         hurry = bool(silent) or self._folders.map_out is None or bool(self._not_ready)
         maps = "mapper" not in self._not_ready  # else there is nothing to save yet
         if self._saving_at_end and maps and not silent and waited_s <= SAVE_END_S:
@@ -270,8 +273,9 @@ class ProcessRun:
     def _end_now(self) -> None:
         if self._saving_at_end and "mapper" in self._not_ready:
             self._dispatch(MapSaved("", 0, "nothing is mapped yet"))
-        missing = " and the ".join(sorted(self._stages.waiting - {"viewer"}))
-        log.warning("ended without waiting for the %s", missing)
+        if self._capturing:
+            missing = " and the ".join(sorted(self._stages.waiting - {"viewer"}))
+            log.warning("ended without waiting for the %s", missing)
         self._abandon()
         raise _Finished
 

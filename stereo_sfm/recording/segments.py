@@ -24,6 +24,7 @@ from typing import Any
 
 from stereo_sfm.drivers.mcap import IMAGES, RECORDING
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular, read_bytes, read_text
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.scan import summary_is_whole
@@ -75,7 +76,7 @@ class Segment:
     def marked_by_hand(self) -> bool:
         """Whether a person marked it."""
         try:
-            lines = self.mark_file.read_text("utf-8", "replace").splitlines()
+            lines = read_bytes(self.mark_file).decode(errors="replace").splitlines()
         except FileNotFoundError:
             return False
         except OSError:
@@ -86,7 +87,7 @@ class Segment:
     def sent_names(self) -> set[str]:
         """The files of its recording that are in a bucket."""
         try:
-            lines = (self.folder / SENT).read_text("utf-8", "replace").splitlines()
+            lines = read_bytes(self.folder / SENT).decode(errors="replace").splitlines()
         except OSError:
             return set()
         return {line.partition("  ")[2] for line in lines}
@@ -124,7 +125,7 @@ class Segment:
 def sent_whole(folder: Path) -> bool:
     """Whether all of a recording is in a bucket, and its checksums with it."""
     try:
-        return (folder / SENT).read_bytes().endswith(SENT_END)
+        return read_bytes(folder / SENT).endswith(SENT_END)
     except OSError:
         return False
 
@@ -181,7 +182,7 @@ def describe(folder: Path, source: str, mode: str, began: datetime) -> None:
 def about(folder: Path) -> dict[str, Any]:
     """The content of recording.json; empty where it is missing or damaged."""
     try:
-        data = json.loads((folder / RECORDING).read_text("utf-8"))
+        data = json.loads(read_text(folder / RECORDING))
     except (OSError, ValueError):
         return {}
     return data if isinstance(data, dict) and data.get("kind") == KIND else {}
@@ -205,7 +206,7 @@ def _poses_s(path: Path, size: int, written_ns: int) -> float | None:
 
     Args: path; size and written_ns, of the file, so that each of its states is read once.
     """
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         if not summary_is_whole(stream):
             return None
     try:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.recording.segments import RECORDING, SENT, SENT_END, Segment, recordings, segments, sent_whole
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import SUMS, Pace, send_file, sha256
@@ -110,9 +111,9 @@ class Uploader:
             return
         about = folder / RECORDING
         if about.is_file():
-            objects.write(self.to / folder.name / RECORDING, about.read_bytes())
-        objects.write(self.to / folder.name / SUMS, sent.read_bytes())
-        sent.write_bytes(sent.read_bytes() + SENT_END)
+            objects.write(self.to / folder.name / RECORDING, read_bytes(about))
+        objects.write(self.to / folder.name / SUMS, read_bytes(sent))
+        sent.write_bytes(read_bytes(sent) + SENT_END)
         if not segments(folder):  # the quota has removed them meanwhile
             for path in (about, sent):
                 path.unlink(missing_ok=True)

@@ -11,9 +11,11 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from typing import Any
 
+from stereo_sfm.pipeline.fork_server import watched_start
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS, ignored_by_children
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.pipeline.threads import thread_environment
@@ -31,10 +33,15 @@ def pipe() -> tuple[Connection, Connection]:
     return multiprocessing.get_context("spawn").Pipe(duplex=False)
 
 
-def start_child(name: str, body: Callable[..., None], *arguments: Any) -> BaseProcess:
-    """Start a process; the ends of pipes among its arguments are closed here, so that its death is an end of file."""
-    context = multiprocessing.get_context("spawn")
-    with ignored_by_children(), thread_environment(1):
+def start_child(
+    name: str, body: Callable[..., None], *arguments: Any, context: SpawnContext | ForkServerContext | None = None
+) -> BaseProcess:
+    """Start a process; the ends of pipes among its arguments are closed here, so that its death is an end of file.
+
+    Args: context, which has loaded what the body calls.
+    """
+    context = context or multiprocessing.get_context("spawn")
+    with ignored_by_children(), thread_environment(1), watched_start():
         process = context.Process(target=body, args=arguments, name=name, daemon=True)
         process.start()
     for argument in arguments:

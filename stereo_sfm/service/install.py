@@ -45,7 +45,7 @@ UMask=0027
 Environment=HOME={state} NUMBA_CACHE_DIR=/var/cache/stereo-sfm MPLCONFIGDIR=/var/cache/stereo-sfm
 LimitNOFILE=4096
 OOMPolicy=continue
-Nice=-5
+LimitNICE=-5
 NoNewPrivileges=yes
 ProtectSystem=strict
 ProtectHome=read-only

@@ -102,7 +102,8 @@ class OutputProcess:
         if self._outbox is not None:
             self._outbox.close()
         if self._process is not None:
-            self._process.join(END_S)
+            if self.wants:  # else it is not open yet, and has nothing to close
+                self._process.join(END_S)
             if self._process.is_alive():
                 self._process.kill()
         self._thread.join(END_S)

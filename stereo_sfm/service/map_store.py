@@ -29,6 +29,8 @@ from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
+from stereo_sfm.pipeline.child import raise_priority
+from stereo_sfm.pipeline.fork_server import start_context
 from stereo_sfm.service.child import end_with_service, pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
@@ -141,8 +143,9 @@ class MapStore:
         if self._base is not None and self._process is None and not self._died:
             (requests, self._requests), (self._result, send) = pipe(), pipe()
             self._process = start_child(
-                "map saver", _keep_joined, self._base, self.session, self.folder, self.config, requests, send
-            )
+                "map saver", _keep_joined, self._base, self.session, self.folder, self.config, requests, send,
+                context=start_context(self.config.pipeline.threads),
+            )  # fmt: skip
 
     def join(self) -> None:
         """Begin to write the saved map from the session's part as it is now."""
@@ -213,6 +216,7 @@ class MapStore:
 def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests: Connection, send: Connection) -> None:
     """Body of the process: joins the session's part on request; a thread that mostly rests looks for its loops."""
     end_with_service()
+    raise_priority("mapper")
     try:
         growing = GrowingMap(load_map(base), configured_vocabulary(config.loop), config)
     except (StereoSfmError, OSError) as error:

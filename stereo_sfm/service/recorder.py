@@ -212,7 +212,8 @@ class Recorder:
         if outbox is not None:
             outbox.close()
         if process is not None:
-            process.join(CLOSE_S + 0.5)
+            if self.state.recording or self._number:  # else there is nothing to write
+                process.join(CLOSE_S + 0.5)
             if process.is_alive():
                 if self.state.recording:
                     log.warning("the recorder did not end in time: the last seconds may be missing")

@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.log.provenance import Opening
+from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.watchdog import Heartbeat, HeartbeatThread
 from stereo_sfm.recording.segment_recorder import Policy, RecorderState, SegmentRecorder
@@ -55,6 +56,7 @@ class Read:
 
 def run_recorder(messages: Connection, to_main: Connection) -> None:
     """Body of the process."""
+    raise_priority("logger")
 
     def work(send: Send) -> None:
         body = _Body(send)

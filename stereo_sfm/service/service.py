@@ -15,6 +15,7 @@ from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.allocator import Release, return_large_blocks, share_one_heap
+from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.service.camera import patient
 from stereo_sfm.service.commands import Commands
@@ -89,6 +90,7 @@ class Service(Commands):
         self._listener = Listener("service", self._publish_line)
         self._over = threading.Event()  # no more poses come
         self._recorded = threading.Event()  # the recording is closed
+        self._saved = threading.Event()  # the map is written
         self._ended = threading.Event()  # everything is written
         self.error: StereoSfmError | None = None  # why it ended by itself
         self._failure = ""  # of the last check that failed
@@ -139,6 +141,7 @@ class Service(Commands):
         return {**stages, **{name: pid for name, pid in others.items() if pid is not None}}
 
     def _run_pipelines(self) -> None:
+        raise_priority()  # the recorder and the outputs, which clients keep busy, were started before
         try:
             self._pipelines.run()
         except StereoSfmError as error:
@@ -150,6 +153,7 @@ class Service(Commands):
         finally:
             self._over.set()
             self._maps.finish(self._pipelines.stopped_s + END_S, self._pipelines.map_complete)
+            self._saved.set()
             self._recorded.wait()
             self._ended.set()
 
@@ -163,7 +167,7 @@ class Service(Commands):
 
     def _keep_checking(self) -> None:
         tidy = Release(RELEASE_CHECKS)
-        while not self._ended.wait(CHECK_S) and self._pipelines.stopping_s < OUTPUTS_S:
+        while not self._saved.wait(CHECK_S) and self._pipelines.stopping_s < OUTPUTS_S:
             self._check()
             tidy.step()
         self._check()  # once more: the outputs get the final state

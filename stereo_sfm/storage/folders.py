@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular, read_bytes
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.remote import Remote
 from stereo_sfm.storage.stream import RangeStream
@@ -32,7 +33,7 @@ def cache_root() -> Path:
 
 def sha256(path: Path) -> str:
     """Of a file."""
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -49,7 +50,7 @@ class Pace:
         Raises:
             InterruptedError: `stopped` became true.
         """
-        with path.open("rb") as stream:
+        with open_regular(path) as stream:
             while piece := stream.read(PIECE if not self.bytes_s else max(min(PIECE, int(self.bytes_s / 4)), 4096)):
                 self.wait(len(piece), stopped)
                 yield piece
@@ -149,7 +150,7 @@ def check_sums(folder: Path, name: str) -> None:
     listing = folder / SUMS
     if not listing.is_file():
         return
-    for file, digest in read_sums(listing.read_text("utf-8", "replace")).items():
+    for file, digest in read_sums(read_bytes(listing).decode(errors="replace")).items():
         path = folder / file
         if not path.is_file() or sha256(path) != digest:
             raise StereoSfmError(f"{name}: {file} is not what was sent (its checksum is wrong): send it again")

@@ -40,6 +40,7 @@ from tests.log.recordings import fisheye_rig, stereo_images, write_recording
 from tests.maps.maps import small_map
 
 MOST_SECONDS = 40.0  # of processor time for one file of two gigabytes
+MOST_MB = 600  # of the process that reads one file after the other
 MOST_LINES = 40  # that one command may say
 HANGS_S = 300.0  # of wall clock
 FIRST_SEED = int(os.environ.get("FUZZ_SEED", "0"))
@@ -99,6 +100,8 @@ def check(child: Child, case: str, argv: list[str]) -> list[str]:
         wrong.append(f"says {found['message'][:600]!r}")
     if found["seconds"] > MOST_SECONDS:
         wrong.append(f"{found['seconds']:.1f} s")
+    if found["peak_mb"] > MOST_MB:
+        wrong.append(f"{found['peak_mb']} MB")
     return [f"{case}: {' '.join(argv[:1])}: {text}" for text in wrong]
 
 
@@ -286,6 +289,7 @@ def test_bombs(kind: str, recordings: list[Path], saved_map: Path, child: Child,
         ({"code": 2, "message": "a\nb\n"}, "says 'a"),
         ({"code": 1}, "exit code 1"),
         ({"seconds": 60.0}, "60.0 s"),
+        ({"peak_mb": 700}, "700 MB"),
     ],
 )
 def test_faults_are_seen(found: dict[str, Any], says: str) -> None:
@@ -294,7 +298,7 @@ def test_faults_are_seen(found: dict[str, Any], says: str) -> None:
             pass
 
         def outcome(self, argv: list[str]) -> dict[str, Any]:
-            return {"code": 0, "message": "", "trace": "", "seconds": 0.0, **found}
+            return {"code": 0, "message": "", "trace": "", "seconds": 0.0, "peak_mb": 0, **found}
 
     faults = check(Answers(), "case", ["info"])
     assert faults and says in faults[0]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import logging
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -27,25 +28,28 @@ COUNT = 2000
 
 
 @contextmanager
-def _no_failure_of_ours(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[list[Any]]:
-    """Nothing is printed, and the guard needs its last resort for nothing but bad numbers."""
+def _no_failure_of_ours(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> Generator[list[Any]]:
+    """Nothing is printed or logged as an error, and the guard needs its last resort for nothing but bad numbers."""
     failures: list[Any] = []
     monkeypatch.setattr(guard.Guard, "_report", lambda self, scope, error: failures.append((scope["path"], error)))
     yield failures
     assert not capfd.readouterr().err
+    assert not [record.exc_info for record in caplog.records if record.levelno >= logging.ERROR]
     assert all("digits" in str(error) for _, error in failures), failures
 
 
 @pytest.mark.parametrize("rules", [Access(TOKEN), Access()])
 def test_the_page_answers_anything(
-    rules: Access, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    rules: Access, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     rng = random.Random(5)
     service = FakeService({"recording_files": Reply(True, "", {"files": []})})
     output = PageOutput("127.0.0.1", 0, 4.0, rules)
     output.open(service)
     try:
-        with _no_failure_of_ours(monkeypatch, capfd):
+        with _no_failure_of_ours(monkeypatch, capfd, caplog):
             found = Counter(status(output.port, request(rng, output.port)) // 100 for _ in range(COUNT // 2))
         assert status(output.port, f"GET / HTTP/1.1\r\nHost: localhost\r\nA: {TOKEN}\r\n\r\n".encode()) == 200
     finally:
@@ -53,13 +57,28 @@ def test_the_page_answers_anything(
     assert found[5] == 0 and found[4] > COUNT // 8 and found[2] > 10, found
 
 
-def test_foxglove_answers_anything(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_bad_body_of_a_head_request_is_refused_quietly(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    with _no_failure_of_ours(monkeypatch, capfd, caplog):
+        output = PageOutput("127.0.0.1", 0, 4.0, Access(TOKEN))
+        output.open(FakeService())
+        head = f"HEAD / HTTP/1.1\r\nHost: 127.0.0.1:{output.port}\r\nTransfer-Encoding: chunked\r\n\r\n"
+        try:
+            assert status(output.port, head.encode() + b" " * 20_000) in (0, 400)
+        finally:
+            output.close()
+
+
+def test_foxglove_answers_anything(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
     connect: Callable[..., Any] = pytest.importorskip("websockets.sync.client").connect
     output = FoxgloveOutput(FoxgloveConfig(port=0), Access(TOKEN))
     output.open(FakeService())
     address, rng = f"ws://127.0.0.1:{output.port}/?token={TOKEN}", random.Random(6)
     try:
-        with _no_failure_of_ours(monkeypatch, capfd) as failures:
+        with _no_failure_of_ours(monkeypatch, capfd, caplog) as failures:
             assert Counter(status(output.port, request(rng, output.port)) // 100 for _ in range(COUNT // 4))[5] == 0
             with connect(address, subprotocols=["foxglove.sdk.v1"], max_queue=None) as client:
                 for frame in frames(rng, COUNT // 4):

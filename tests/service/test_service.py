@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.saved_map import load_map
+from stereo_sfm.service import service as service_module
 from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig, SourceConfig
 from stereo_sfm.service.messages import PoseUpdate, ServiceState, Started, Status
 from stereo_sfm.service.service import Service
@@ -32,9 +34,18 @@ def wait_for(what: Callable[[], object]) -> None:
 
 def config(tmp_path: Path, mode: str = "extend", every_min: float = 5.0) -> RobotConfig:
     return RobotConfig(
-        map=MapConfig(str(tmp_path / "store"), mode, every_min),
+        map=MapConfig(str(tmp_path / "store"), mode, save_every_min=every_min),
         recording=RecordingConfig(folder=str(tmp_path / "recordings")),
     )
+
+
+def test_pipelines_go_first_and_outputs_do_not(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Clients keep outputs busy; the process from which stages are forked is started by the thread of the pipelines."""
+    raised: list[str] = []
+    monkeypatch.setattr(service_module, "raise_priority", lambda: raised.append(threading.current_thread().name))
+    with Service(config(tmp_path), MadeSource.of(endless_wall), outputs={}):
+        wait_for(lambda: raised)
+    assert raised == ["pipelines"]
 
 
 @pytest.mark.slow

@@ -14,7 +14,9 @@ from stereo_sfm.messages import MapSaved
 from stereo_sfm.pipeline.processes import END_S, IN_FLIGHT_S, SAVE_END_S, ProcessRun
 from stereo_sfm.service import service
 from stereo_sfm.service.config import MapConfig, RobotConfig
+from stereo_sfm.service.link import OutputProcess
 from stereo_sfm.service.outputs import OUTPUTS, TIDY
+from stereo_sfm.service.publisher import Reply
 from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
 
@@ -29,6 +31,7 @@ def test_stages_with_a_backlog_are_waited_for_only_until_the_map_is_written(
     run, ended = ProcessRun(MadeSource.of(endless_wall), Config()), list[float]()
     monkeypatch.setattr(run, "_end_now", lambda: ended.append(waited_s))
     run._not_ready = set() if ready else {"mapper"}  # pyright: ignore[reportPrivateUsage]
+    run._capturing = True  # pyright: ignore[reportPrivateUsage]
     run.save_map(tmp_path, urgent=True)
     if saved:
         run._dispatch(MapSaved(str(tmp_path), 1))  # pyright: ignore[reportPrivateUsage]
@@ -37,6 +40,40 @@ def test_stages_with_a_backlog_are_waited_for_only_until_the_map_is_written(
         run._progress_s = time.monotonic() - END_S - 1  # pyright: ignore[reportPrivateUsage]
         run._enforce_end(waited_s, time.monotonic(), [])  # pyright: ignore[reportPrivateUsage]
     assert ended and min(ended) == pytest.approx(0.1 + (SAVE_END_S if ready and not saved else IN_FLIGHT_S), abs=0.11)
+
+
+def test_before_the_first_image_only_the_camera_is_waited_for(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    run, ended = ProcessRun(MadeSource.of(endless_wall), Config()), list[bool]()
+    monkeypatch.setattr(run, "_end_now", lambda: ended.append(True))
+    for waiting, ends in (({"capture", "tracker"}, False), ({"tracker", "mapper"}, True)):
+        monkeypatch.setattr(type(run._stages), "waiting", waiting)  # pyright: ignore[reportPrivateUsage]
+        ended.clear()
+        run._enforce_end(0.1, time.monotonic(), [])  # pyright: ignore[reportPrivateUsage]
+        assert bool(ended) == ends
+
+
+def test_an_output_that_is_not_open_yet_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy computer it loads its code for longer than a stop may take."""
+
+    class Loading:
+        def __init__(self) -> None:
+            self.joined, self.killed = list[float](), False
+
+        def join(self, timeout_s: float) -> None:
+            self.joined.append(timeout_s)
+
+        def is_alive(self) -> bool:
+            return not self.killed
+
+        def kill(self) -> None:
+            self.killed = True
+
+    process = Loading()
+    output = OutputProcess("pose_socket", RobotConfig(), lambda *_: Reply(True, ""))
+    monkeypatch.setattr(output, "_thread", process)
+    monkeypatch.setattr(output, "_process", process)
+    output.close()
+    assert process.killed and len(process.joined) == 1  # the thread that has started it
 
 
 def test_recorder_and_outputs_end_while_the_map_is_still_written(

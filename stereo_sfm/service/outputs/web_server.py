@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from stereo_sfm.errors import StereoSfmError
@@ -61,7 +62,7 @@ class WebServer:
         config = uvicorn.Config(
             guard,
             loop="asyncio",  # it calls the door's `accept`
-            http="h11",
+            http=_protocol(),
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
             ws_per_message_deflate=False,
@@ -85,3 +86,17 @@ class WebServer:
             self._thread.join(END_S)
         if self.door is not None:
             self.door.close()
+
+
+def _protocol() -> type[Any]:
+    """Uvicorn's, which refuses a bad body of a HEAD request, too: its reason would be a body, where none may be."""
+    import h11
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class Protocol(H11Protocol):
+        def send_400_response(self, msg: str) -> None:
+            with suppress(h11.LocalProtocolError):
+                super().send_400_response(msg)
+            self.transport.close()
+
+    return Protocol

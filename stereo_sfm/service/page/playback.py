@@ -9,6 +9,7 @@ from typing import Any
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.scan import summary_is_whole
@@ -55,7 +56,7 @@ def _state(segment: Segment) -> tuple[Path, int, int]:
 
 @functools.lru_cache(maxsize=10_000)
 def _stamps(path: Path, size: int, written_ns: int) -> tuple[int, ...]:
-    with path.open("rb") as stream:
+    with open_regular(path) as stream:
         if not summary_is_whole(stream):
             return ()
     with LogReader(path) as reader:

@@ -1,0 +1,105 @@
+"""Files that a user names may be pipes, devices or of any size: all of them are opened by `stereo_sfm.input_file`."""
+
+from __future__ import annotations
+
+import ast
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stereo_sfm.calib import load_rig
+from stereo_sfm.calib.mask import read_mask
+from stereo_sfm.drivers.folder_source import UnreadableImage, read_gray
+from stereo_sfm.drivers.ground_truth import read_trajectory
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.compare import stats_of
+from stereo_sfm.input_file import NotAFile, read_bytes
+from stereo_sfm.loop.vocabulary_file import load_vocabulary
+from stereo_sfm.maps.header import read_header
+from stereo_sfm.maps.saved_map import load_map, save_map
+from tests.maps.maps import small_map
+
+ROOT = Path(__file__).parents[1]
+# Files that open others themselves: those of the system, and those that this program has just written or brings along.
+OWN = {
+    "stereo_sfm/cli.py", "stereo_sfm/input_file.py", "stereo_sfm/log/machine.py", "stereo_sfm/same_code.py",
+    "stereo_sfm/jobs.py", "stereo_sfm/service/health.py", "stereo_sfm/pipeline/watchdog.py",
+    "stereo_sfm/service/page/app.py", "stereo_sfm/service/outputs/floor_grid.py", "stereo_sfm/eval/report.py",
+    "stereo_sfm/eval/html_page.py", "stereo_sfm/eval/calibration_results.py", "stereo_sfm/commands/batch.py",
+    "drivers/registry.py",
+}  # fmt: skip
+READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt"}
+
+
+def opens(call: ast.Call) -> bool:
+    """Whether a call reads a file by its path, unchecked."""
+    if isinstance(call.func, ast.Name):
+        return call.func.id == "open"
+    if not isinstance(call.func, ast.Attribute):
+        return False
+    if call.func.attr in READERS:
+        return not (isinstance(call.func.value, ast.Name) and call.func.value.id == "input_file")
+    mode = call.args[0].value if call.args and isinstance(call.args[0], ast.Constant) else ""
+    return call.func.attr == "open" and mode in ("r", "rb")
+
+
+def test_every_reader_goes_through_input_file() -> None:
+    found: list[str] = []
+    for folder in ("stereo_sfm", "drivers", "calib"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            name = path.relative_to(ROOT).as_posix()
+            if name in OWN:
+                continue
+            tree = ast.parse(path.read_text("utf-8"))
+            found += [f"{name}:{n.lineno}" for n in ast.walk(tree) if isinstance(n, ast.Call) and opens(n)]
+    assert not found, f"use stereo_sfm.input_file: {found}"
+
+
+def test_what_the_search_finds() -> None:
+    texts = {
+        "open(path)": True, "path.open('rb')": True, "path.read_text()": True, "cv2.imread(name)": True,
+        "read_text(path)": False, "input_file.read_text(path)": False, "path.open('w')": False, "source.open()": False,
+    }  # fmt: skip
+    for text, wanted in texts.items():
+        call = ast.parse(text, mode="eval").body
+        assert isinstance(call, ast.Call) and opens(call) == wanted, text
+
+
+def _read_rig_of_map(path: Path) -> object:
+    folder = path.parent / "map"
+    save_map(small_map()[1], folder)
+    (folder / "rig.yaml").unlink()
+    path.rename(folder / "rig.yaml")
+    return load_map(folder)
+
+
+READS: dict[str, Callable[[Path], Any]] = {
+    "a.kitti": load_rig, "rig.yaml": load_rig, "mask.png": read_mask, "image.png": read_gray,
+    "truth.csv": read_trajectory, "map.json": lambda p: read_header(p.parent, ()),
+    "stats.json": lambda p: stats_of(p.parent), "words.npz": load_vocabulary, "of_a_map.yaml": _read_rig_of_map,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", READS)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_pipe_or_a_device_is_one_line(name: str, kind: str, tmp_path: Path) -> None:
+    """Reading a pipe would wait for a writer, /dev/zero has no end."""
+    path = tmp_path / name
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    with pytest.raises((StereoSfmError, UnreadableImage)) as error:
+        READS[name](path)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_refused_file_is_both_kinds_of_error(tmp_path: Path) -> None:
+    with pytest.raises(NotAFile, match=f"^cannot read {tmp_path}: it is not a file$") as error:
+        read_bytes(tmp_path)
+    assert isinstance(error.value, OSError) and isinstance(error.value, StereoSfmError)
+    assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
