@@ -33,7 +33,7 @@ from stereo_sfm.types import F64, U8, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "3"  # of the files: grows when the same input gives other bits
+VERSION = "4"  # of the files: grows when the same input gives other bits
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
