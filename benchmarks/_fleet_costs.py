@@ -17,7 +17,7 @@ from unittest.mock import patch
 
 import psutil
 from _fleet_faults import PLAN, started_cluster
-from _fleet_verdicts import Verdicts
+from _verdicts import Verdicts
 
 from stereo_sfm.config import Config
 from stereo_sfm.demo import demo_recording

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from _fleet_verdicts import Verdicts
+from _verdicts import Verdicts
 
 from stereo_sfm.config import Config
 from stereo_sfm.fleet.catalogue import ask, delta_bytes, opened

@@ -30,7 +30,7 @@ sys.path.insert(0, str(ROOT))
 
 from _fleet_costs import delta, info, overhead
 from _fleet_faults import nights, two_writers
-from _fleet_verdicts import Verdicts
+from _verdicts import Verdicts
 
 from tests.fleet.s3_server import server
 
@@ -70,7 +70,7 @@ def main() -> None:
                 nights(verdicts, s3, place, options.stores, options.nights, options.kills, options.pause, options.seed)
             verdicts.keep()
     if options.write:
-        print(verdicts.write(PARTS), file=sys.stderr)
+        print(verdicts.write(PARTS, "fleet", "Nights of a fleet with faults"), file=sys.stderr)
     sys.exit(verdicts.failed)
 
 

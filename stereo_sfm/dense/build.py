@@ -34,7 +34,7 @@ from stereo_sfm.types import F64, U8, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "3"  # of the files: grows when the same input gives other bits
+VERSION = "4"  # of the files: grows when the same input gives other bits
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
@@ -168,7 +168,7 @@ def _depth(task: Any) -> KeptDepth | None:
         return None
     now, before, folder, voxel, floor_T_cam, session = task
     path, key = folder / f"{now.number:06d}.npz", _depth_key(now, before)
-    found = _read_depth(path, key)
+    found = read_depth(path, key)
     if found is None:
         found = keyframe_depth(now, before)
         if found is None:
@@ -198,7 +198,8 @@ def _depth_columns(depth: DepthImage) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _read_depth(path: Path, key: str | None) -> DepthImage | None:
+def read_depth(path: Path, key: str | None = None) -> DepthImage | None:
+    """A stored depth image; None where there is none, or not of `key`."""
     data = _read(path, key)
     if data is None:
         return None
@@ -210,13 +211,13 @@ def _read_depth(path: Path, key: str | None) -> DepthImage | None:
 def some_depths(folder: Path, count: int) -> list[DepthImage]:
     """Depth images of a reconstruction, evenly spread over its keyframes. Args: folder, of `build`."""
     paths = sorted((folder / "depth").glob("*.npz"))
-    found = [_read_depth(paths[(2 * k + 1) * len(paths) // (2 * count)], None) for k in range(min(count, len(paths)))]
+    found = [read_depth(paths[(2 * k + 1) * len(paths) // (2 * count)]) for k in range(min(count, len(paths)))]
     return [depth for depth in found if depth is not None]
 
 
 @lru_cache(CACHED)
 def _cached_depth(path: Path, key: str) -> DepthImage:
-    found = _read_depth(path, key)
+    found = read_depth(path, key)
     if found is None:
         raise StereoSfmError(f"{path} was removed or changed while it was used: run again")
     return found

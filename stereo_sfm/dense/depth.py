@@ -1,4 +1,4 @@
-"""Depth of one view: matching, refinement, standard deviations."""
+"""Depth of one view: matching, refinement, means over surfaces, standard deviations."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from stereo_sfm.dense.matching import AGREE_PX, agreeing, match_both_ways
 from stereo_sfm.dense.noise import learned_sigmas
 from stereo_sfm.dense.refinement import refine
+from stereo_sfm.dense.surface_mean import SUPPORT, surface_means
 from stereo_sfm.dense.views import PairView
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F32, F64, U8, ReadOnly
@@ -45,7 +46,8 @@ def disparities(left: U8, right: U8, count: int, step: int = 1) -> tuple[F32, F3
         other = np.ascontiguousarray(other[:, ::-1])
         found = agreeing(found, other, AGREE_PX)
     predicted = np.where(np.isfinite(found), predicted, np.nan).astype(np.float32)
-    return found, learned_sigmas(found, predicted, step)
+    found, predicted = surface_means(found, predicted, step)
+    return found, learned_sigmas(found, predicted, -(-SUPPORT // step))
 
 
 def pair_depth(view: PairView, left: U8, right: U8, step: int = 1) -> DepthImage:

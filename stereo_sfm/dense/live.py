@@ -74,7 +74,7 @@ class LiveDepthMaker:
         gradient = cv2.Sobel(image, cv2.CV_32F, 1, 0, scale=1 / 8)
         energy: Any = cv2.boxFilter(gradient * gradient, -1, (TEXTURE_PX, TEXTURE_PX))
         predicted = np.where(np.isfinite(disparity), 1 / (TEXTURE_PX * np.sqrt(energy + 1e-3)), np.nan)
-        return learned_sigmas(disparity, predicted.astype(np.float32), 1, STEP)
+        return learned_sigmas(disparity, predicted.astype(np.float32), TEXTURE_PX, STEP)
 
     def _seen_ahead(self, ranges: F32) -> U16:
         depth = np.where(self._inside, ranges[self._pick], 0) * self._along * 1000

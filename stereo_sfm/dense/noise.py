@@ -11,23 +11,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereo_sfm.dense.refinement import RADIUS, SAME_SURFACE
+from stereo_sfm.dense.refinement import SAME_SURFACE
 from stereo_sfm.types import F32
 
-APART = 2 * RADIUS + 1  # px between windows that share no pixel
 BINS = 16  # by predicted noise, of equal numbers
 FEW = 50  # second differences a bin: below, the image is too empty to learn from
 ONE_SIGMA = 0.6827  # share within one standard deviation
 UNLEARNED = 2.0  # over the predicted noise, where nothing can be learned
 
 
-def learned_sigmas(disparity: F32, predicted: F32, step: int = 1, sparse: int = 1) -> F32:
+def learned_sigmas(disparity: F32, predicted: F32, apart: int, sparse: int = 1) -> F32:
     """(H, W) px standard deviations of disparities (H, W), from those (H, W) that grey-level noise predicts.
 
-    `step`: px of the image between two of these disparities. `sparse`: learn from every such row and column alone.
+    `apart`: rows or columns between two that share no pixel. `sparse`: learn from every such row and column alone.
     """
     some = np.s_[::sparse, ::sparse]
-    apart, noise = _second_differences(disparity[some], predicted[some], -(-APART // (step * sparse)))
+    apart, noise = _second_differences(disparity[some], predicted[some], -(-apart // sparse))
     if len(apart) < BINS * FEW:
         return (UNLEARNED * predicted).astype(np.float32)
     order = np.argsort(noise, kind="stable")

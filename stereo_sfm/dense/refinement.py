@@ -22,6 +22,7 @@ SPREAD = 2.5  # px, standard deviation of the weights by distance
 LIKENESS = 20.0  # grey levels at which the weight by likeness falls to 1/e
 ON_PLANE = 0.5  # px from the plane at which a pixel's weight falls to a quarter
 SAME_SURFACE = 1.5  # px of disparity from the middle's within which a pixel takes part in the plane
+FLAT_PX2 = 0.3  # of `plane_through`: beside a window's 6.7 px^2
 UNKNOWN_WEIGHT = 0.05  # of pixels without disparity: mostly occluded, but they may be all that there is
 ITERATIONS = 6
 FARTHEST = 1.5  # px from the start: beyond, another match was found
@@ -48,6 +49,20 @@ def refine(left: U8, right: U8, disparity: F32, step: int = 1) -> tuple[F32, F32
 
 
 @inner
+def plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd, flat):
+    """Least squares from weighted sums over x, y and d: slopes along both, d at the origin, its variance (weights 1).
+
+    `flat`: added to the spread of x and of y, so that few values in a row give no slope across it.
+    """
+    mx, my, md = sx / n, sy / n, sd / n
+    xx, yy, xy = sxx / n - mx * mx + flat, syy / n - my * my + flat, sxy / n - mx * my
+    xd, yd = sxd / n - mx * md, syd / n - my * md
+    det = xx * yy - xy * xy
+    a, b = (yy * xd - xy * yd) / det, (xx * yd - xy * xd) / det
+    return a, b, md - a * mx - b * my, (1.0 + (yy * mx * mx - 2.0 * xy * mx * my + xx * my * my) / det) / n
+
+
+@inner
 def _slopes(disparity, u, v):
     """Slopes of the disparity along columns and rows around a pixel, by least squares over its surface."""
     n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
@@ -66,11 +81,8 @@ def _slopes(disparity, u, v):
             sd += q
             sxd += dx * q
             syd += dy * q
-    mx, my, md = sx / n, sy / n, sd / n
-    xx, yy, xy = sxx / n - mx * mx + 0.3, syy / n - my * my + 0.3, sxy / n - mx * my  # 0.3: few pixels give no slope
-    xd, yd = sxd / n - mx * md, syd / n - my * md
-    det = xx * yy - xy * xy
-    return (yy * xd - xy * yd) / det, (xx * yd - xy * xd) / det
+    found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd, FLAT_PX2)
+    return found[0], found[1]
 
 
 @njit

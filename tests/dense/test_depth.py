@@ -10,6 +10,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.dense.depth import disparities, pair_depth
 from stereo_sfm.dense.matching import match_both_ways
 from stereo_sfm.dense.refinement import refine
+from stereo_sfm.dense.surface_mean import surface_means
 from stereo_sfm.dense.views import PairView, motion_view, stereo_view
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
@@ -89,6 +90,28 @@ def test_disparities_are_finer_than_the_matchers_and_know_how_fine() -> None:
     assert 0.55 < (error <= sigma)[known].mean() < 0.85
     again = disparities(noisy[0], noisy[1], 32)
     np.testing.assert_array_equal(again[0], found)
+
+
+def test_windows_with_hardly_any_texture_are_known_from_those_around_and_steps_stay() -> None:
+    """A floor of faint texture beside a box 3 px nearer: what a window does not know, its surface does."""
+    rng = np.random.default_rng(4)
+    v, u = np.mgrid[0:120, 0:160].astype(np.float32)
+    plane = 6.2 + 0.015 * u - 0.02 * v
+    shift = np.where(u < 80, plane, plane + 3).astype(np.float32)
+    sigma = np.where(v < 60, 0.3, 0.03).astype(np.float32)
+    found = (shift + rng.normal(0, sigma)).astype(np.float32)
+    mean, spread = surface_means(found, sigma)
+    error, before = np.abs(mean - shift), np.abs(found - shift)
+    for part in (v < 48, v > 72):
+        for side in (u < 80, u >= 80):
+            assert np.median(error[part & side]) < 0.5 * np.median(before[part & side])
+    assert 0.6 < (error <= spread).mean() < 0.85
+    # a pixel with texture amid others without keeps its own
+    lone = np.full((60, 60), 0.3, np.float32)
+    lone[30, 30] = 0.01
+    bent = np.full((60, 60), 5.0, np.float32)
+    bent[30, 30] = 5.2
+    assert abs(surface_means(bent, lone)[0][30, 30] - 5.2) < 0.01
 
 
 def test_nothing_is_found_where_there_is_no_texture() -> None:

@@ -1,4 +1,4 @@
-"""The rows of `benchmarks fleet`, kept in a file so that a run that was broken off goes on with the next part.
+"""Rows of sentences that must hold, kept in a file so that a run that was broken off goes on with the next part.
 
 The figures name each commit that made a part of them.
 """
@@ -61,11 +61,11 @@ class Verdicts:
     def failed(self) -> bool:
         return any(not row.holds for rows in self._rows.values() for row in rows)
 
-    def write(self, parts: Sequence[str]) -> Path:
+    def write(self, parts: Sequence[str], name: str, title: str) -> Path:
         """Replace the benchmark's figures, in the order of the parts."""
         figures: list[Figure] = []
         for row in (row for part in parts for row in self._rows.get(part, [])):
             holds = "yes" if row.holds else "no"
             figures += [Figure(row.sentence, "measured", row.figure), Figure(row.sentence, "holds", holds)]
         made = dict.fromkeys(self._commits[part] for part in parts if part in self._commits)
-        return write("fleet", "Nights of a fleet with faults", figures, at=", ".join(made))
+        return write(name, title, figures, at=", ".join(made))

@@ -1,0 +1,162 @@
+"""Rows of `benchmarks dense` from drives: rendered ones with exact ranges, real ones by what the next image shows."""
+
+from __future__ import annotations
+
+import hashlib
+import resource
+import subprocess
+import sys
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _figures import commit
+from _verdicts import Verdicts
+from scipy.spatial import cKDTree
+
+from stereo_sfm.dense.build import read_depth
+from stereo_sfm.dense.depth import DepthImage
+from stereo_sfm.dense.inputs import find_input, keyframes
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
+from stereo_sfm.dense.views import stereo_view
+from stereo_sfm.drivers.sim.kernels import FACING
+from stereo_sfm.drivers.sim.render import Renderer
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, Bool
+
+NEAR_M, CLOSE_M = 2.5, 0.05  # what is measured; of the F-score and of covered surface
+SAME_GREY = 10  # levels
+CLI = [sys.executable, "-m", "stereo_sfm.cli"]
+
+
+def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays: int) -> None:
+    """One drive to a mesh, by the commands a user has; the seed follows from the commit, so that nobody chose it."""
+    seed = int(hashlib.sha256(f"{commit().rstrip('+')} {camera}".encode()).hexdigest()[:7], 16)
+    spec = f"sim:loop?camera={camera}&rays={rays}&seed={seed}&length={metres:g}&rate=15"
+    run = folder / f"{camera}_{seed}_{metres:g}_{rays}"
+    if not (run / "map" / "map.json").is_file():
+        _call("run", spec, "-o", str(run), "--map-out", str(run / "map"), "--log", "full", "--inline", "-q")
+    began = time.perf_counter()
+    _call("dense", str(run), "-o", str(run / "surface"), "-q")
+    took, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+    errors, mesh = _compared(spec, run)
+    name = f"{camera}, {metres:g} m, seed {seed}"
+    middle, most = 100 * np.quantile(errors, [0.5, 0.9])
+    verdicts.row(f"{name}: depth of fronts, median at most 1 %", middle <= 1, f"{middle:.2f} %")
+    verdicts.row(f"{name}: 90 % of it below 3 %", most <= 3, f"{most:.2f} %")
+    covered, off, score = mesh
+    verdicts.row(f"{name}: fronts covered, at least 80 %", covered >= 0.8, f"{100 * covered:.1f} %")
+    verdicts.row(f"{name}: mesh off by at most 1 cm at the median", off <= 0.01, f"{100 * off:.2f} cm")
+    verdicts.row(f"{name}: F-score at 5 cm at least 0.9", score >= 0.9, f"{score:.3f}")
+    verdicts.row(f"{name}: map to mesh in at most 180 s", took <= 180, f"{took:.0f} s")
+    verdicts.row(f"{name}: at most 2 GB a process", peak <= 2, f"{peak:.2f} GB")
+
+
+def _call(*args: str) -> None:
+    subprocess.run([*CLI, *args], check=True)
+
+
+def _compared(spec: str, run: Path) -> tuple[F64, tuple[float, float, float]]:
+    """Relative errors of depths of fronts; covered share of fronts, median distance of the mesh (m), F-score."""
+    saved = find_input(run).saved
+    source: Any = open_source(spec)
+    renderer, frames = Renderer(source.world, source.rig), saved.snapshot.frame_ids
+    truth_T_map = source.pose(int(frames[0])) @ se3.inverse(saved.snapshot.map_T_kf[0])
+    errors, points, normals, fronts = [], [], [], []
+    for path in sorted((run / "surface" / "depth").glob("*.npz")):
+        pose = source.pose(int(frames[int(path.stem)]))
+        view = renderer.view(0, pose)
+        front = ((view.ids >> 4) & 7 == FACING) & (view.ids >= 0) & (view.depth < NEAR_M)
+        depth = read_depth(path)
+        assert depth is not None
+        errors.append(_range_errors(depth, source.rig.left, view.depth, front))
+        seen = source.rig.left.bearing_grid() * view.depth[..., None]
+        normal = np.cross(np.gradient(seen, axis=1), np.gradient(seen, axis=0))
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+        some = np.s_[::2, ::2]
+        good = np.isfinite(seen[some]).all(-1) & np.isfinite(normal[some]).all(-1)
+        points.append(se3.transform(pose, seen[some][good]))
+        normals.append(normal[some][good] @ pose[:3, :3].T)
+        fronts.append(front[some][good])
+    every, which = _thinned(np.concatenate(points))
+    mesh = se3.transform(truth_T_map @ _map_T_floor(run), _vertices(run / "surface" / "cloud.ply"))
+    away, nearest = cKDTree(every).query(mesh)
+    plane = np.abs(((mesh - every[nearest]) * np.concatenate(normals)[which][nearest]).sum(1))
+    found = cKDTree(mesh).query(every[np.concatenate(fronts)[which]])[0] < CLOSE_M
+    right, complete = float((away < CLOSE_M).mean()), float(found.mean())
+    return np.concatenate(errors), (complete, float(np.median(plane)), 2 * right * complete / (right + complete))
+
+
+def _range_errors(depth: DepthImage, camera: Any, ranges: Any, front: Bool) -> F64:
+    """Of the pixels of a depth image that show fronts."""
+    uv = camera.project(depth.camera.bearing_grid() @ depth.cam_R_view.T)
+    inside = camera.inside(uv, -0.49)
+    at = np.rint(np.where(inside[..., None], uv, 0)).astype(int)
+    good = inside & front[at[..., 1], at[..., 0]] & np.isfinite(depth.ranges)
+    return np.abs(depth.ranges / ranges[at[..., 1], at[..., 0]] - 1)[good]
+
+
+def _thinned(points: F64) -> tuple[F64, Any]:
+    """One point a centimetre cube, and its row."""
+    _, first = np.unique(np.floor(points / 0.01).astype(np.int64), axis=0, return_index=True)
+    return points[first], first
+
+
+def _vertices(path: Path) -> F64:
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    count = int(head.split(b"element vertex ")[1].split()[0])
+    rows = np.frombuffer(body, np.dtype([("xyz", "<f4", 3), ("colour", "u1", 3)]), count)
+    return rows["xyz"].astype(float)
+
+
+def _map_T_floor(run: Path) -> F64:
+    import yaml
+
+    return np.array(yaml.safe_load((run / "surface" / "costmap.yaml").read_text())["map_T_floor"]).reshape(4, 4)
+
+
+def real(verdicts: Verdicts, folder: Path, name: str, spec: str, most: int, sgbm: Any) -> None:
+    """Whether depth and pose tell what the next keyframe shows, beside the single pair's depth by OpenCV alone."""
+    run = folder / f"real_{name}"
+    if not (run / "map" / "map.json").is_file():
+        _call("run", spec, "-o", str(run), "--map-out", str(run / "map"), "--log", "full", "--inline", "-q")
+    recent: deque[KeyframeImages] = deque(maxlen=16)
+    last: KeyframeImages | None = None
+    agree: list[Bool] = []
+    for now in keyframes(find_input(run)):
+        if last is None or shows_more(last, now):
+            if last is not None and last.right is not None:
+                agree.append(_agreements(last, earlier(recent, last), now, sgbm))
+            last = now
+        recent.append(now)
+        if len(agree) == most:
+            break
+    ours, base = 100 * np.concatenate(agree, axis=1).mean(axis=1)
+    text = f"{ours:.1f} % instead of {base:.1f} %"
+    verdicts.row(f"{name}: more of the next image predicted than by SGBM", ours > base, text)
+
+
+def _agreements(now: KeyframeImages, before: KeyframeImages | None, after: KeyframeImages, sgbm: Any) -> Bool:
+    """(2, N) of the pixels that both predict: whether the next image is as bright where each of both puts it."""
+    ours = keyframe_depth(now, before)
+    assert ours is not None and now.right is not None
+    scale = 640 / max(now.rig.left.size)
+    view = stereo_view(now.rig, min(1.0, scale))
+    a, b = view.images(now.left, now.right)
+    found = sgbm(a, b, view.disparities)
+    found[~view.first.mask] = np.nan
+    base = view.ranges(found)[::2, ::2]
+    to_next = se3.inverse(after.map_T_cam) @ now.map_T_cam
+    rays = ours.camera.bearing_grid() @ ours.cam_R_view.T
+    same, seen = [], []
+    for ranges in (ours.ranges, base):
+        uv = after.rig.left.project(se3.transform(to_next, (rays * ranges[..., None]).reshape(-1, 3)))
+        inside = after.rig.left.inside(uv, -0.49)
+        at = np.rint(np.where(inside[:, None], uv, 0)).astype(int)
+        there = after.left[at[:, 1], at[:, 0]].astype(int)
+        same.append(np.abs(there - ours.grey.ravel()) <= SAME_GREY)
+        seen.append(inside)
+    return np.stack(same)[:, seen[0] & seen[1]]
