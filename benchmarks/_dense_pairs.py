@@ -55,7 +55,7 @@ def _pair(
         shares = [100 * float((np.rint(d) == truth)[used & both].mean()) for d in (found, base)]
         text = f"{shares[0]:.1f} %; SGBM {shares[1]:.1f} %"
         verdicts.row(f"{name}: rounded as its truth is, more pixels right than SGBM's", shares[0] > shares[1], text)
-        return  # its standard deviations cannot be told from rounding
+        return  # rounding hides its standard deviations
     _held(verdicts, name, np.abs(found - truth)[used] <= sigma[used])
 
 
