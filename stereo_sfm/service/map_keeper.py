@@ -47,6 +47,7 @@ class MapKeeper:
         self._ending = False
         self._last = False  # the last save was requested
         self._before: tuple[int, int] | None = None  # what was written at that request
+        self._taken: tuple[int, int] | None = None  # what was written when a join was requested last
 
     @property
     def mode(self) -> str:
@@ -103,7 +104,7 @@ class MapKeeper:
                 self._next_folder = None
             folders = self._store.begin()
             self._asked = self._answered = self._ended = 0
-            self._again = False
+            self._again, self._taken = False, None
             self._session += 1
             self._end_request("the pipeline was started again: save once more")
         self.is_new = folders.map_in is None
@@ -118,8 +119,8 @@ class MapKeeper:
             self._answered += 1
             if not message.why:
                 self._session_saved.set()
-                if not self._ending:
-                    self._store.join()
+                self._taken = self._store.written()
+                self._store.join()
                 return
             self._end_request(message.why)
         log.log(logging.WARNING if message.keyframes else logging.INFO, "the map was not saved: %s", message.why)
@@ -144,7 +145,8 @@ class MapKeeper:
             return
         if not (self._store.saves and (written or self._session_saved.is_set())):
             return
-        self._store.join()
+        if self._store.written() != self._taken or not self._store.joining:  # the mapper wrote once more at its end
+            self._store.join()
         joined = self._store.joined(max(until_s - time.monotonic(), 0.0))
         while joined is not None and self._store.joining:  # an earlier one may have read a folder that was replaced
             joined = self._store.joined(max(until_s - time.monotonic(), 0.0))

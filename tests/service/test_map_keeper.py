@@ -169,6 +169,34 @@ def test_a_session_that_was_written_but_did_not_reply_is_not_a_loss(
     assert not any("NOT saved" in line for line in said) and any("is saved: 7 keyframes" in line for line in said)
 
 
+@pytest.mark.parametrize("once_more", [False, True])
+def test_the_last_part_is_joined_while_the_stages_still_end(once_more: bool, tmp_path: Path) -> None:
+    """A mapper that comes to its end may write once more; else the first join is the last."""
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    store, joins = maps._store, list[Any]()  # pyright: ignore[reportPrivateUsage]
+
+    def join() -> None:
+        joins.append(store.written())
+        store._waiting += 1  # pyright: ignore[reportPrivateUsage]
+
+    def joined(timeout_s: float = 0.0) -> Joined:
+        store._waiting -= 1  # pyright: ignore[reportPrivateUsage]
+        return Joined(7)
+
+    store.join, store.joined = join, joined
+    maps.save_last(asked)
+    store.session.mkdir()
+    (store.session / "map.json").write_text("1")
+    maps.session_saved(MapSaved("", 7))
+    assert joins == [store.written()]
+    if once_more:
+        (store.session / "map.json").unlink()
+        (store.session / "map.json").write_text("2")
+    maps.finish(time.monotonic(), complete=True)
+    assert len(joins) == 1 + once_more and not store.joining
+
+
 def _service_that_dies(send: Any) -> None:
     child = start_child("map saver", _work)
     send.send(child.pid)
