@@ -38,7 +38,7 @@ def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays
     spec = f"sim:loop?camera={camera}&rays={rays}&seed={seed}&length={metres:g}&rate=15"
     run = folder / f"{camera}_{seed}_{metres:g}_{rays}"
     if not (run / "map" / "map.json").is_file():
-        _call("run", spec, "-o", str(run), "--map-out", str(run / "map"), "--log", "full", "--inline", "-q")
+        _call("run", spec, "-o", str(run), "--log", "full", "--inline", "-q")
     began = time.perf_counter()
     _call("dense", str(run), "-o", str(run / "surface"), "-q")
     took, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
@@ -122,7 +122,7 @@ def real(verdicts: Verdicts, folder: Path, name: str, spec: str, most: int, sgbm
     """Whether depth and pose tell what the next keyframe shows, beside the single pair's depth by OpenCV alone."""
     run = folder / f"real_{name}"
     if not (run / "map" / "map.json").is_file():
-        _call("run", spec, "-o", str(run), "--map-out", str(run / "map"), "--log", "full", "--inline", "-q")
+        _call("run", spec, "-o", str(run), "--log", "full", "--inline", "-q")
     recent: deque[KeyframeImages] = deque(maxlen=16)
     last: KeyframeImages | None = None
     agree: list[Bool] = []

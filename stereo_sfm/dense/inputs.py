@@ -44,7 +44,10 @@ def _own_images(folder: Path) -> tuple[str, ...]:
     """The log of a run where it has images, else the source that it read."""
     path = folder / RUN_LOG
     if not path.is_file():
-        raise StereoSfmError(f"{folder} holds no images: name the recording of this map with --images SOURCE")
+        raise StereoSfmError(
+            f"{folder} holds no images: name the recording of this map with --images SOURCE, "
+            "or run again with --log full"
+        )
     with LogReader(path) as reader:
         run = read_run(reader)
     if run.image_format not in ("none", ""):

@@ -267,7 +267,8 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
     assert "is not the folder of a run or a map" in fails(tmp_path / "none", "-o", tmp_path / "out")
     save_map(small_map()[1], tmp_path / "store")
-    assert "--images SOURCE" in fails(tmp_path / "store", "-o", tmp_path / "out")
+    without = fails(tmp_path / "store", "-o", tmp_path / "out")
+    assert "--images SOURCE" in without and "--log full" in without
     assert "no such file" in fails(tmp_path / "store", "-o", tmp_path / "out", "--images", "gone.mcap")
     assert "--slice takes two heights" in fails(tmp_path / "store", "-o", tmp_path / "out", "--slice", "0.6,0.1")
     assert "--voxel" in fails(tmp_path / "store", "-o", tmp_path / "out", "--voxel", "0")
