@@ -35,6 +35,7 @@ def override(name: str, text: str) -> str:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until the source ends, SIGTERM or Ctrl-C."""
+    from stereo_sfm.pipeline.fork_server import kill_fork_server
     from stereo_sfm.service.config import explain, load
     from stereo_sfm.service.outputs.access import page_link
     from stereo_sfm.service.service import Service
@@ -73,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
             print(f"the page: {page_link(config)}", flush=True)
         while not service.wait(1.0):  # a short wait lets signals through
             pass
+    kill_fork_server()  # which may still load its code, where the service ended while it started
     if service.error is not None:
         raise service.error
     sys.stdout.flush()

@@ -130,6 +130,8 @@ class OutputProcess:
         self.starts += 1
         self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT)
         self._replies = DroppingOutbox(to_client, LIMIT)
+        if self._closing.is_set():  # `close` came while it was started, and has not seen it
+            process.kill()
         follow(self.name, process, reports, self._take)
         self.wants = frozenset()
         reports.close()

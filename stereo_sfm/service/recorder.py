@@ -117,6 +117,8 @@ class Recorder:
             self._send(policy)
 
     def _start_recording(self) -> None:
+        if self._closing:
+            return
         if self.mode == "off":
             self._send(Finish())
             return

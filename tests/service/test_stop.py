@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.messages import MapSaved
 from stereo_sfm.pipeline.processes import END_S, IN_FLIGHT_S, SAVE_END_S, ProcessRun
-from stereo_sfm.service import service
+from stereo_sfm.service import link, service
 from stereo_sfm.service.config import MapConfig, RobotConfig
 from stereo_sfm.service.link import OutputProcess
 from stereo_sfm.service.outputs import OUTPUTS, TIDY
@@ -74,6 +75,22 @@ def test_an_output_that_is_not_open_yet_is_not_waited_for(monkeypatch: pytest.Mo
     monkeypatch.setattr(output, "_process", process)
     output.close()
     assert process.killed and len(process.joined) == 1  # the thread that has started it
+
+
+def test_an_output_that_is_started_during_a_stop_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else it would wait for messages, and the service for its end."""
+    output = OutputProcess("pose_socket", RobotConfig(), lambda *_: Reply(True, ""))
+    start = link.start_child
+
+    def started(*arguments: Any) -> Any:
+        output._closing.set()  # pyright: ignore[reportPrivateUsage]
+        return start(*arguments)
+
+    monkeypatch.setattr(link, "start_child", started)
+    thread = threading.Thread(target=output._run_once, daemon=True)  # pyright: ignore[reportPrivateUsage]
+    thread.start()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
 
 
 def test_recorder_and_outputs_end_while_the_map_is_still_written(
