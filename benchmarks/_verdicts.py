@@ -46,7 +46,7 @@ class Verdicts:
 
     def row(self, sentence: str, holds: bool, figure: str) -> None:
         """A result of the part that runs."""
-        row = Row(sentence, holds, figure)
+        row = Row(sentence, bool(holds), figure)  # numpy has a bool of its own, which JSON does not know
         self._rows.setdefault(self._part, []).append(row)
         print(row.text(), flush=True)
 

@@ -3,7 +3,7 @@
     python docs/pictures.py [NAME ...]
 
 rerun draws `viewer.png` without a window. It needs a graphics adapter, or Mesa's software one (Debian:
-mesa-vulkan-drivers). `errors.png` is a plot of the report.
+mesa-vulkan-drivers). `errors.png` is a plot of the report, `surface.png` four pictures of `stereo-sfm dense`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 T = TypeVar("T")
 DOCS = Path(__file__).parent
 SIZE = "1600x950"
 MESSAGES_S = 15.0  # that the viewer shows its first messages
 ATTEMPTS = 60
+WIDE_PX = 1000  # of surface.png
 
 
 def viewer(run: Path, picture: Path) -> None:
@@ -70,7 +71,32 @@ def errors(run: Path, picture: Path) -> None:
     shutil.copy(run / "errors.png", picture)
 
 
-PICTURES: dict[str, Callable[[Path, Path], None]] = {"errors.png": errors, "viewer.png": viewer}
+def surface(run: Path, picture: Path) -> None:
+    """The mesh by height and by grey level, and two depth images below."""
+    import cv2
+    import numpy as np
+
+    folder = run / "surface"
+    subprocess.run(
+        [sys.executable, "-m", "stereo_sfm.cli", "dense", run, "-q", "-o", folder, "--voxel", "0.05"], check=True
+    )
+    parts: list[Any] = []
+    for names in (("mesh_height", "mesh_grey"), ("depth_1", "depth_2")):
+        pair = [cv2.imread(str(folder / f"{name}.png")) for name in names]
+        parts.append(np.hstack([_half(image) for image in pair]))
+    cv2.imwrite(str(picture), np.vstack(parts), [cv2.IMWRITE_PNG_COMPRESSION, 9])
+
+
+def _half(image: Any) -> Any:
+    """Half as wide as the picture, as both of a row are of one shape."""
+    import cv2
+
+    return cv2.resize(
+        image, (WIDE_PX // 2, WIDE_PX // 2 * image.shape[0] // image.shape[1]), interpolation=cv2.INTER_AREA
+    )
+
+
+PICTURES: dict[str, Callable[[Path, Path], None]] = {"errors.png": errors, "surface.png": surface, "viewer.png": viewer}
 
 
 def main(names: list[str]) -> None:

@@ -26,13 +26,13 @@ def learned_sigmas(disparity: F32, predicted: F32, apart: int, sparse: int = 1) 
     `apart`: rows or columns between two that share no pixel. `sparse`: learn from every such row and column alone.
     """
     some = np.s_[::sparse, ::sparse]
-    apart, noise = _second_differences(disparity[some], predicted[some], -(-apart // sparse))
-    if len(apart) < BINS * FEW:
+    found, noise = _second_differences(disparity[some], predicted[some], -(-apart // sparse))
+    if len(found) < BINS * FEW:
         return (UNLEARNED * predicted).astype(np.float32)
     order = np.argsort(noise, kind="stable")
     parts = np.array_split(order, BINS)
     x = [float(np.median(noise[part])) for part in parts]
-    y = [float(np.quantile(apart[part], ONE_SIGMA)) for part in parts]
+    y = [float(np.quantile(found[part], ONE_SIGMA)) for part in parts]
     return np.interp(predicted, x, y).astype(np.float32)  # keeps NaN
 
 
