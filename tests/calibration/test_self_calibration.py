@@ -132,7 +132,7 @@ def test_all_windows_count_at_the_end() -> None:
     estimator, found = revisions(true, turned(true, (0.0, 0.1, 0.0)), 3, count=56)
     left = estimator.estimate(list(estimator.windows)).without(np.arange(RIG_TERMS) == 1)
     assert found[-1].why == "refined"
-    assert left.strength[1] < 0.2  # but what is not evident
+    assert left.strength[1] < 0.05
 
 
 def test_lengths_stay_without_evidence_about_them() -> None:
