@@ -83,7 +83,6 @@ class SelfCalibration:
         """`rig`: the calibrated rig, two cameras. `applies`: revisions change the rig of the run."""
         self._rig, self.applies = rig, applies
         self.terms: F64 = np.zeros(RIG_TERMS)  # current corrections
-        self._found: F64 = np.zeros(RIG_TERMS)  # those that the windows show, of lengths more than is evident
         self._corrected = np.zeros(RIG_TERMS, bool)
         self._keyframes: list[SeenPoints] = []
         self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # of the rig as it is now turned
@@ -216,7 +215,7 @@ class SelfCalibration:
         """
         halves = halves or (windows[::2], windows[1::2] or windows)  # one window: what a step has left
         basis = self._basis(windows)
-        kept = np.asarray(np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self._found)), float)
+        kept = np.asarray(np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self.terms)), float)
         courses = [] if drift else [constant(part, self._expected).at([1.0]) for part in (windows, *halves)]
         ignored = self._taken_back | (len(windows) < INTRODUCED)
         found = drift.at_the_end if drift else courses
@@ -232,23 +231,9 @@ class SelfCalibration:
         if hunting.any() and not drift:
             self._taken_back, self._corrected = self._taken_back | hunting, self._corrected & ~hunting
             return self._change(windows, drift, refined_sigmas, halves)
-        if not choice.value.any() and np.array_equal(kept, self._found):
-            return None
-        back_from = np.asarray(np.linalg.inv(basis), float)
-        found = basis @ kept + choice.value
-        value = back_from @ self._evident(found) - self.terms
-        return _Change(value, choice.sigma, whole.by(back_from).covariance, choice.selected, back_from @ found)
-
-    def _evident(self, found: F64) -> F64:
-        """The found terms (8,), in the basis, with as much of the one that changes lengths as is evident.
-
-        Tracks lean to one side by a share of their noise, in all windows alike, and trade disparities for lengths so.
-        What is expected of a term, under a prior as wide as what is found, is less than that (James and Stein,
-        Estimation with quadratic loss, Proc. 4th Berkeley Symp. 1, 1961).
-        """
-        bias = BIAS_SHARE * float(np.mean([w.noise_px for w in self.windows] or [0.0])) * self._of_pixel[1]
-        share = found[1] ** 2 / max(found[1] ** 2 + bias**2, 1e-24)
-        return np.where(np.arange(RIG_TERMS) == 1, share, 1.0) * found
+        value = np.asarray(np.linalg.solve(basis, choice.value), float) + back
+        covariance = whole.by(np.asarray(np.linalg.inv(basis), float)).covariance
+        return _Change(value, choice.sigma, covariance, choice.selected) if value.any() else None
 
     def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
         return choose(whole, parts, self._rig.readout_s > 0, sigmas, self._corrected)
@@ -282,7 +267,7 @@ class SelfCalibration:
         sigma = np.sqrt(np.diag(covariance))
         self.windows = deque((w.turned(change) for w in self.windows), maxlen=MAX_WINDOWS)
         self._since, self._turned_kf_id = self._turned_kf_id, -1
-        found = _Change(change, sigma, covariance, np.abs(change) > SIGMAS * sigma, self._found + change)
+        found = _Change(change, sigma, covariance, np.abs(change) > SIGMAS * sigma)
         revision = self._revision(found, "step", self._since)
         self._sigma = np.full(RIG_TERMS, np.inf)
         return revision
@@ -290,7 +275,7 @@ class SelfCalibration:
     def _revision(
         self, change: _Change, why: str, since_kf_id: int, on_the_way: tuple[tuple[int, F64], ...] = ()
     ) -> Revision:
-        self.terms, self._found = self.terms + change.value, change.found
+        self.terms = self.terms + change.value
         self._corrected |= change.selected
         self._sigma = change.sigma
         self._revised_ns = self._stamp_ns
@@ -337,7 +322,6 @@ class _Change:
     sigma: F64  # (8,) of those of the basis
     covariance: F64  # (8, 8)
     selected: Bool  # (8,)
-    found: F64  # (8,) all that the windows show, from the calibrated rig on
 
 
 def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:
