@@ -22,7 +22,7 @@ SPREAD = 2.5  # px, standard deviation of the weights by distance
 LIKENESS = 20.0  # grey levels at which the weight by likeness falls to 1/e
 ON_PLANE = 0.5  # px from the plane at which a pixel's weight falls to a quarter
 SAME_SURFACE = 1.5  # px of disparity from the middle's within which a pixel takes part in the plane
-FLAT_PX2 = 0.3  # of `plane_through`: beside a window's 6.7 px^2
+FLAT_PX2 = 0.3  # added to the spread of x and of y (a window's: 6.7), so that few values in a row give no slope across
 UNKNOWN_WEIGHT = 0.05  # of pixels without disparity: mostly occluded, but they may be all that there is
 ITERATIONS = 6
 FARTHEST = 1.5  # px from the start: beyond, another match was found
@@ -49,13 +49,10 @@ def refine(left: U8, right: U8, disparity: F32, step: int = 1) -> tuple[F32, F32
 
 
 @inner
-def plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd, flat):
-    """Least squares from weighted sums over x, y and d: slopes along both, d at the origin, its variance (weights 1).
-
-    `flat`: added to the spread of x and of y, so that few values in a row give no slope across it.
-    """
+def plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd):
+    """Least squares from weighted sums over x, y and d: slopes along both, d at the origin, its variance."""
     mx, my, md = sx / n, sy / n, sd / n
-    xx, yy, xy = sxx / n - mx * mx + flat, syy / n - my * my + flat, sxy / n - mx * my
+    xx, yy, xy = sxx / n - mx * mx + FLAT_PX2, syy / n - my * my + FLAT_PX2, sxy / n - mx * my
     xd, yd = sxd / n - mx * md, syd / n - my * md
     det = xx * yy - xy * xy
     a, b = (yy * xd - xy * yd) / det, (xx * yd - xy * xd) / det
@@ -81,7 +78,7 @@ def _slopes(disparity, u, v):
             sd += q
             sxd += dx * q
             syd += dy * q
-    found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd, FLAT_PX2)
+    found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
     return found[0], found[1]
 
 

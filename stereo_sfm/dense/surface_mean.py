@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.dense.refinement import FLAT_PX2, RADIUS, SAME_SURFACE, plane_through
+from stereo_sfm.dense.refinement import RADIUS, SAME_SURFACE, plane_through
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F32
 
@@ -64,7 +64,7 @@ def _means(disparity, sigma, pitch):
                     sd += k * q
                     sxd += k * dx * q
                     syd += k * dy * q
-            found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd, FLAT_PX2)
+            found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
             out[v, u] = middle + found[2]
             spread[v, u] = math.sqrt(found[3])
     return out, spread
