@@ -27,7 +27,7 @@ CHOSEN = (0, 5, 10)  # the pairs that are examined, if the first one does not fi
 LOOKED_AT = CHOSEN[-1] + 1 + MAX_SHIFT  # images: some on either side of these, where pairs may be frames apart
 CORNERS = 100  # of the left image
 SEARCH_ROWS = 14  # above and below, px
-MIN_CORNERS = 25  # with fewer an image shows too little to judge a calibration
+MIN_CORNERS = 25  # with fewer, and fewer matches, an image shows too little to judge a calibration
 MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
 FITTING_SHARE = 0.5  # of the matches
 CALIBRATE = "'stereo-sfm calibrate' measures lenses; 'stereo-sfm convert-calib --lens' says what a file's numbers are"
@@ -122,7 +122,7 @@ class _Cameras:
         window = still_window(self.rectification, image, CORNERS, SEARCH_ROWS)
         found = window.rows
         self.windows.append(window)
-        self.judged |= found.corners >= MIN_CORNERS
+        self.judged |= found.corners >= MIN_CORNERS or len(found) >= MIN_MATCHES
         ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
         near = ahead & (np.abs(found.row_error) < LIMIT_PX)
         rows_fit = len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE

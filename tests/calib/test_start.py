@@ -115,6 +115,23 @@ def test_a_large_error_is_found_and_corrected(pair: tuple[s.Rig, list[s.StereoIm
     assert check_start(found.rig, images).text == ""
 
 
+def test_few_corners_with_matches_are_enough(data_root: Path) -> None:
+    """A small part of the shelf between smooth walls: 20 corners, 15 of them with a match."""
+    with s.open_source(data_root / "store_walk") as source:
+        rig, images = source.rig, list(islice(source, 13))
+    height, width = images[0].left.shape
+    part = np.zeros((height, width), bool)
+    part[int(0.4 * height) : int(0.6 * height), int(0.3 * width) : int(0.7 * width)] = True
+    wall = np.repeat(np.linspace(40, 200, height).astype(np.uint8)[:, None], width, 1)
+    few = [
+        replace(image, left=np.where(part, image.left, wall), right=np.where(part, right_of(image), wall))
+        for image in images
+    ]
+    found = check_start(wrong(rig, rows=-6.0), few)
+    assert found.rig is not None and found.shown and "6.0 px" in found.text
+    assert check_start(rig, few).rig is None
+
+
 def test_small_errors_and_right_calibrations_stay(pair: tuple[s.Rig, list[s.StereoImage]]) -> None:
     rig, images = pair
     read = iter(images)
