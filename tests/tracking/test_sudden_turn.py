@@ -116,6 +116,23 @@ def test_on_a_mount_that_gives_nothing_is_sudden() -> None:
     assert sequence.see((0.1, float(hops[-1]), 0.0))
 
 
+def test_vibration_that_comes_back_is_no_rotation() -> None:
+    """A camera that vibrates by 0.01 degrees hops by 0.04, and beyond where it was: what comes back has not turned."""
+    sequence, rng = Sequence(RIGS["pinhole"], 0.02), np.random.default_rng(0)
+    assert not any(sequence.see((0.0, x, 0.0)) for x in 0.01 * rng.standard_normal(60))
+    assert not any(sequence.see((0.0, x, 0.0)) for x in (0.0, 0.04, -0.03, 0.0))
+    assert sequence.see((0.0, 0.1, 0.0))
+
+
+def test_a_rotation_on_top_of_a_steady_one() -> None:
+    """Errors of distances look like a rotation that goes on: what it does not explain is sudden."""
+    sequence, rng = Sequence(RIGS["pinhole"], 0.02), np.random.default_rng(0)
+    course = np.cumsum(0.02 + 0.002 * rng.standard_normal(60))
+    assert not any(sequence.see((0.0, x, 0.0)) for x in course)
+    assert sequence.see((0.0, course[-1] + 0.08, 0.0))
+    assert np.rad2deg(sequence.turns.turn) == pytest.approx((0.0, 0.06, 0.0), abs=0.01)
+
+
 @pytest.fixture(scope="module", params=["pinhole&size=320x200", "fisheye&size=424x400"])
 def knocked(request: pytest.FixtureRequest) -> tuple[Rig, list[StereoImage], Trajectory]:
     """A rig, and the images of one whose right camera is knocked."""

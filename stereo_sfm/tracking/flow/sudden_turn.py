@@ -3,7 +3,8 @@
 Between two successive images the pose moves what both cameras see alike. What moves the right pixels of all points
 besides, as one rotation of the right camera would, is such a rotation. Errors of the rig, of lenses and of distances
 are the same in both images, so that a hundredth of a degree is seen. How much the rotation scatters from image to image
-(vibration, a mount that gives, cameras that are triggered apart) is learned. Sudden is what the sequence has not shown
+(vibration, a mount that gives, cameras that are triggered apart) is learned, and what it has to do with the rotation of
+the image before: vibration goes there and back, a wrong distance goes on. Sudden is what the sequence has not shown
 before, and after which the camera stays as it is.
 """
 
@@ -47,7 +48,8 @@ class SuddenTurns:
         self.covariance: F64 = np.zeros((3, 3))  # of `turn`
         self._followed = np.zeros(3), np.zeros((3, 3))  # by what it has turned in the images since, and covariance
         self._new = False  # noticed in the last image
-        self._usual: F64 = USUAL**2 * np.eye(3)  # covariance of the rotation from image to image
+        self._last: F64 = np.zeros(3)  # the rotation of the image before, without what was sudden
+        self._usual: F64 = USUAL**2 * np.eye(6)  # covariance of the rotations to an image and to the one before
         self._images = USUAL_IMAGES  # that have shown it
         self._said: F64 = np.zeros(3)  # `turn` of the last news
 
@@ -75,10 +77,20 @@ class SuddenTurns:
         )  # fmt: skip
         if count < MIN_POINTS:
             return False
-        usual = covariance + self._usual
-        sudden = self._significant(turn, usual)
+        last, self._last = self._last, turn
+        of_this, of_last = self._usual[:3, :3], self._usual[3:, 3:]
+        by = np.linalg.solve(of_last, self._usual[3:, :3]).T
+        expected, usual = by @ last, of_this - by @ self._usual[3:, :3] + covariance
+        # What goes back to where it was before the image before has not turned.
+        back = of_this + self._usual[:3, 3:] + self._usual[3:, :3] + of_last + covariance
+        goes_back = Estimate(turn + last, back).reach < Estimate(last, of_last).reach
+        sudden = self._significant(turn - expected, usual) and not goes_back
         self._images = min(self._images + 1.0, REMEMBERED_IMAGES)
-        self._usual = self._usual + (np.outer(turn, turn) - self._usual) / self._images
+        both = np.concatenate([turn, last])
+        self._usual = self._usual + (np.outer(both, both) - self._usual) / self._images
+        turn = turn - expected
+        if sudden:
+            self._last = expected
         if sudden and (self._new or not self.turn.any()):  # one rotation may begin during an exposure
             self.turn, self.covariance, self._new = self.turn + turn, self.covariance + usual, not self._new
             if not self._significant(self.turn, self.covariance):  # there and back
@@ -115,7 +127,7 @@ class SuddenTurns:
 
     def confirmed(self, turn: F64) -> None:
         """The rig has been corrected by a rotation (3,)."""
-        rest, uncertain = self.turn - turn, self.covariance + self._usual
+        rest, uncertain = self.turn - turn, self.covariance + self._usual[:3, :3]
         self._forget()
         self._said = self.turn
         if self._significant(rest, uncertain):
