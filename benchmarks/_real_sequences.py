@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from _sequences import data_root
 
 FOLDER = "STEREO_SFM_REAL"  # environment variable: the sequences that are laid out from public repositories
+CHANGED = "backwards", "mirrored", "upside down"  # what `benchmarks changed` makes of pairs
 BONN_STARTS_S = (0.0, 1.0, 2.0, 7.0, 7.8, 9.0, 10.0, 12.0, 14.0, 15.5, 16.0, 16.5, 18.0, 20.0, 22.0, 23.0)
 
 
@@ -47,6 +48,7 @@ class Sequence:
     long: bool = False  # and of two cameras: enough images before and after a step
     closed: bool = False  # ends about where it starts
     best_cpp: str = ""  # of the C++ systems, ATE
+    changed: str = ""  # one of CHANGED: of another sequence
 
     def path(self, real: Path | None) -> Path | None:
         """Where it lies; None if it is not at hand."""
@@ -59,7 +61,7 @@ class Sequence:
         return [round(s, 4) for s in self.starts_s or frames][:most]
 
 
-SEQUENCES = (
+_AS_THEY_ARE = (
     Sequence(
         "karlsruhe_0019", "karlsruhe_0019", Limits(ate_m=1.2, uncalibrated_ate_m=1.9), rate_hz=9.5, best_cpp="1.41 m",
         long=True,
@@ -100,6 +102,16 @@ SEQUENCES = (
     Sequence("store_walk", "store_walk", rate_hz=15.0, shared=True, long=True),
     Sequence("tum_vi_room1_part", "tum_vi_room1", rate_hz=20.0, starts=1, shared=True),
     Sequence("t265_office_part", "t265_office", rate_hz=30.0, starts=1, shared=True),
+)  # fmt: skip
+
+SEQUENCES = _AS_THEY_ARE + tuple(
+    replace(
+        s, name=f"{s.name} {how}", place=f"changed/{s.name}_{how.replace(' ', '_')}", limits=Limits(lost=s.limits.lost),
+        starts=1, shared=False, rig="", kind="stereo", long=False, best_cpp="", changed=how,
+    )
+    for s in _AS_THEY_ARE
+    if s.kind != "depth"
+    for how in CHANGED
 )  # fmt: skip
 
 

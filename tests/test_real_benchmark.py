@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import itertools
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,8 +16,12 @@ import pytest
 
 from stereo_sfm import config as configuration
 from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import RadTan
+from stereo_sfm.types import Trajectory
+from tests.synthetic import pinhole_rig
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -25,7 +30,8 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 def modules(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
     return {
-        name: importlib.import_module(name) for name in ("_real_run", "_real_sequences", "_real_table", "_real_inject")
+        name: importlib.import_module(name)
+        for name in ("_real_run", "_real_sequences", "_real_table", "_real_inject", "changed")
     }
 
 
@@ -137,3 +143,26 @@ def test_a_report_has_a_row_for_each_switch_and_compares_versions(modules: dict[
     ]
     assert "WORSE THAN BEFORE" in rows[-1] and table.BETTER not in text
     assert len({row.count("|") for row in rows[:-1]}) == 1
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_a_flipped_rig_sees_the_flipped_images(modules: dict[str, ModuleType], upside_down: bool) -> None:
+    """Also with lenses that are decentered; and the truth moves to the new left camera."""
+    camera = pinhole_rig().left
+    lens = RadTan(camera.width, camera.height, camera.fx, camera.fy, 310.0, 190.0, (-0.2, 0.05, 2e-3, -1e-3))
+    away = se3.exp(np.array([0.1, 0.004, -0.01, 0.01, 0.02, -0.01]))
+    rig = Rig(lens, replace(lens, cx=330.0), away)
+    flipped = modules["changed"].flipped_rig(rig, upside_down)
+    points = np.random.default_rng(0).uniform((-1, -1, 2), (1, 1, 6), (50, 3))
+    turn = np.diag([-1.0, -1.0 if upside_down else 1.0, 1.0])
+    old_left, old_right = rig.left.project(points), rig.project_right(points)
+    in_new = (points - away[:3, 3]) @ away[:3, :3] @ turn
+    sign = np.array([-1.0, -1.0 if upside_down else 1.0])
+    edge = np.array([camera.width - 1.0, camera.height - 1.0]) * (sign < 0)
+    assert flipped.left.project(in_new) == pytest.approx(edge + sign * old_right, abs=1e-6)
+    assert flipped.project_right(in_new) == pytest.approx(edge + sign * old_left, abs=1e-6)
+    truth = Trajectory(np.zeros(1, np.int64), se3.exp(np.array([0.3, 1.0, -2.0, 0.1, -0.4, 0.2]))[None])
+    new = modules["changed"].flipped_truth(truth, rig, upside_down)
+    world = points @ truth.poses[0, :3, :3].T + truth.poses[0, :3, 3]
+    seen = in_new @ new.poses[0, :3, :3].T + new.poses[0, :3, 3]
+    assert seen == pytest.approx(world if upside_down else world @ turn, abs=1e-9)

@@ -1,0 +1,115 @@
+"""Real sequences backwards, mirrored and upside down: real images that nobody has looked at.
+
+    STEREO_SFM_REAL=FOLDER STEREO_SFM_DATA=FOLDER python -m benchmarks changed -- [--only NAME]
+
+Each pair sequence of `benchmarks real` is written to STEREO_SFM_REAL/changed as folders of images with calibration and
+ground truth, which `benchmarks real` runs as further sequences. Backwards, a rolling shutter would read from below, so
+these are of global shutters. IMU samples are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from _real_sequences import CHANGED, SEQUENCES, Sequence, real_root
+
+from stereo_sfm.calib.formats.native import write_native
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.export.trajectories import write_tum
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.types import Trajectory
+
+
+def flipped(camera: Camera, upside_down: bool) -> Camera:
+    """A camera whose image is mirrored, or turned by half a turn."""
+    tangential = {"p1": -1.0 if upside_down else 1.0, "p2": -1.0}
+    signs = [tangential.get(name, 1.0) for name in camera.coefficients]
+    return replace(
+        camera,
+        cx=camera.width - 1 - camera.cx,
+        cy=camera.height - 1 - camera.cy if upside_down else camera.cy,
+        distortion=tuple(d * sign for d, sign in zip(camera.distortion, signs, strict=False)),
+    )
+
+
+def flipped_rig(rig: Rig, upside_down: bool) -> Rig:
+    """The right camera becomes the left one."""
+    assert rig.right is not None
+    turn = np.diag([-1.0, -1.0 if upside_down else 1.0, 1.0, 1.0])
+    return Rig(
+        flipped(rig.right, upside_down), flipped(rig.left, upside_down),
+        turn @ se3.inverse(rig.left_T_right) @ turn, name=rig.name,
+    )  # fmt: skip
+
+
+def flipped_truth(truth: Trajectory, rig: Rig, upside_down: bool) -> Trajectory:
+    """Of the new left camera; mirrored, the world is mirrored, too."""
+    turn = np.diag([-1.0, -1.0 if upside_down else 1.0, 1.0, 1.0])
+    poses = truth.poses @ rig.left_T_right @ turn
+    return Trajectory(truth.stamp_ns, poses if upside_down else turn @ poses)
+
+
+def write(sequence: Sequence, place: Path, out: Path, how: str) -> None:
+    """One changed sequence: image folders, times.txt, rig.yaml, groundtruth.tum."""
+    axes = {"mirrored": 1, "upside down": -1}  # of cv2.flip
+    with open_source(str(place), place.parent / sequence.rig if sequence.rig else None) as source:
+        rig, truth = source.rig, source.ground_truth
+        images = [image for image in source if image.right is not None]
+    assert all(image.right is not None for image in images)
+    first_ns, last_ns = images[0].stamp_ns, images[-1].stamp_ns
+    for side in ("left", "right"):
+        (out / side).mkdir(parents=True)
+    times: list[int] = []
+    for k, image in enumerate(images[::-1] if how == "backwards" else images):
+        pair = [image.left, np.asarray(image.right)]
+        if how in axes:
+            pair = [np.asarray(cv2.flip(side, axes[how])) for side in pair[::-1]]
+        for side, pixels in zip(("left", "right"), pair, strict=True):
+            cv2.imwrite(str(out / side / f"{k:06d}.png"), pixels)
+        times.append(last_ns - image.stamp_ns if how == "backwards" else image.stamp_ns - first_ns)
+    np.savetxt(out / "times.txt", np.array(times) * 1e-9, fmt="%.9f")
+    write_native(flipped_rig(rig, how == "upside down") if how in axes else Rig(
+        rig.left, rig.right, rig.left_T_right, name=rig.name), out / "rig.yaml")  # fmt: skip
+    if truth is None:
+        return
+    if how == "backwards":
+        truth = Trajectory((last_ns - truth.stamp_ns)[::-1].copy(), truth.poses[::-1].copy())
+    else:
+        truth = Trajectory(truth.stamp_ns - first_ns, truth.poses)
+        truth = flipped_truth(truth, rig, how == "upside down")
+    write_tum(out / "groundtruth.tum", truth)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Write what is not there yet."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", action="append", default=[], metavar="NAME", help="sequences that begin so; repeat")
+    options = parser.parse_args(args)
+    real = real_root(None)
+    if real is None:
+        print("set STEREO_SFM_REAL to the folder of the real sequences", file=sys.stderr)
+        return 2
+    for sequence in SEQUENCES:
+        place = sequence.path(real)
+        wanted = not options.only or any(sequence.name.startswith(name) for name in options.only)
+        if place is None or sequence.kind == "depth" or sequence.changed or not wanted:
+            continue
+        for how in CHANGED:
+            out = real / "changed" / f"{sequence.name}_{how.replace(' ', '_')}"
+            if not out.exists():
+                part = out.with_suffix(".part")
+                write(sequence, place, part, how)
+                part.rename(out)
+                print(out)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
