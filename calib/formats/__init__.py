@@ -128,10 +128,10 @@ def _recognise_folder(path: Path) -> str | None:
 def _recognise_file(path: Path) -> str | None:
     try:
         text = read_text(path)
-    except (UnicodeDecodeError, OSError):
+    except UnicodeDecodeError:
         raise StereoSfmError(f"calibration {path} is not a text file") from None
-    except ValueError as error:
-        raise StereoSfmError(f"calibration {path}: {error}") from None
+    except OSError as error:
+        raise StereoSfmError(f"calibration {path}: {error.strerror}") from None
     if path.suffix == ".json" or text.lstrip().startswith(("{", "[")):
         marks = {"basalt": '"T_imu_cam"', "depthai": '"cameraData"', "opencv": '"opencv-matrix"', "foxglove": '"K"'}
     elif path.suffix == ".txt":

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from stereo_sfm import input_file
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan, Tilted
-from stereo_sfm.input_file import open_regular
 from stereo_sfm.types import F64
 
 MAX_FILE_BYTES = 4 << 20
@@ -43,13 +43,9 @@ def read_text(path: Path) -> str:
     """A calibration file's text.
 
     Raises:
-        ValueError: larger than any calibration, or not text.
+        OSError: it cannot be read, or is larger than any calibration. UnicodeError: it is no text.
     """
-    with open_regular(path) as file:
-        raw = file.read(MAX_FILE_BYTES + 1)
-    if len(raw) > MAX_FILE_BYTES:
-        raise ValueError(f"larger than {MAX_FILE_BYTES >> 20} MiB, which no calibration is")
-    return raw.decode("utf-8-sig")
+    return input_file.read_text(path, MAX_FILE_BYTES)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

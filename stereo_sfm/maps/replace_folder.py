@@ -12,12 +12,12 @@ COMPLETE = ".complete"  # in a folder that is kept: the new files, all written
 
 
 @contextmanager
-def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
+def replaced_folder(folder: Path, names: frozenset[str], synced: bool = True) -> Generator[Path]:
     """An empty folder to write into; it replaces `folder` at the end of the block.
 
     Until then `folder` is unchanged, also if the block raises or the process is killed; what a process killed at the
     end leaves, `recover` puts right. A folder with files other than `names`, or one that cannot be renamed (a mount,
-    the working directory), is kept and gets the new files one by one.
+    the working directory), is kept and gets the new files one by one. Without `synced` a loss of power may damage it.
     """
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
@@ -27,7 +27,7 @@ def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
     draft.mkdir()
     try:
         yield draft
-        for path in draft.iterdir():
+        for path in draft.iterdir() if synced else ():
             _sync(path)
         if keep:
             draft.rename(folder / COMPLETE)
@@ -35,7 +35,8 @@ def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
             _take_complete(folder)
         else:
             _swap(draft, folder, names)
-        _sync(folder.parent)
+        if synced:
+            _sync(folder.parent)
     finally:
         _remove(draft)
 

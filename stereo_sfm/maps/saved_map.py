@@ -90,13 +90,17 @@ def map_files() -> frozenset[str]:
 
 
 def save_map(
-    saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | None = None, compress: bool = True
+    saved: SavedMap,
+    folder: Path | str,
+    beside: Mapping[str, bytes] | None = None,
+    compress: bool = True,
+    synced: bool = True,
 ) -> None:
     """Write a map folder atomically; other files in it stay.
 
     Args:
         saved: the map. folder: where. beside: further files of the folder, by name.
-        compress: False where the processor is needed for more than the disk.
+        compress: False where the processor is needed for more than the disk. synced: survives a loss of power.
 
     Raises:
         StereoSfmError: the map is empty.
@@ -105,7 +109,7 @@ def save_map(
         raise StereoSfmError("the map is empty: nothing to save")
     folder = Path(folder).expanduser()
     beside = beside or {}
-    with replaced_folder(folder, map_files() | beside.keys()) as draft:
+    with replaced_folder(folder, map_files() | beside.keys(), synced) as draft:
         checksums: dict[str, str] = {}
         for name, columns in _FILES.items():
             path = draft / f"{name}.npz"

@@ -37,7 +37,7 @@ def save_session(saved: SavedMap, place: LoopResult | None, folder: Path) -> Non
         fields: dict[str, Any] = {name: np.asarray(getattr(place, name)) for name in _FIELDS}
         np.savez(buffer, **fields)
         beside[PLACE] = buffer.getvalue()
-    save_map(saved, folder, beside, compress=False)
+    save_map(saved, folder, beside, compress=False, synced=False)  # what is made of it soon is
 
 
 def load_place(folder: Path) -> LoopResult | None:

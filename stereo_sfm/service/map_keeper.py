@@ -168,6 +168,7 @@ class MapKeeper:
             self._end_request(ENDING)
             if self._store.saves and session is not None:
                 self._last, self._before = True, self._store.written()
+                self._store.hurry()
                 self._ask(session, urgent=True)
 
     def check(self, session: Session | None) -> None:

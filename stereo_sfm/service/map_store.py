@@ -155,9 +155,16 @@ class MapStore:
         self._died = False
         self.prepare()
         self._waiting += 1
+        self._request(True)
+
+    def hurry(self) -> None:
+        """The last part comes soon: search for no more loops until then."""
+        self._request(False)
+
+    def _request(self, join: bool) -> None:
         if self._requests is not None:
             with contextlib.suppress(OSError):  # it was killed: its result says so
-                self._requests.send(None)
+                self._requests.send(join)
 
     @property
     def pid(self) -> int | None:
@@ -226,14 +233,17 @@ def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests:
     step, free, work = threading.Lock(), threading.Event(), threading.Event()
     if growing is not None:
         threading.Thread(target=_search, args=(growing, step, free, work), daemon=True).start()
+    hurried = False
     with contextlib.suppress(EOFError, OSError):
         while True:
-            free.set()
-            requests.recv()
+            if not hurried:
+                free.set()
+            hurried |= not (join := requests.recv())
             free.clear()
-            with step:
-                send.send(Joined(why=why) if growing is None else _grown(growing, session, out))
-            work.set()
+            if join:
+                with step:
+                    send.send(Joined(why=why) if growing is None else _grown(growing, session, out))
+                work.set()
 
 
 def _search(growing: GrowingMap, step: threading.Lock, free: threading.Event, work: threading.Event) -> None:

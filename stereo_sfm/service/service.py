@@ -39,8 +39,7 @@ log = logging.getLogger(LOGGER)
 CHECK_S = 0.1  # between two checks of state, map and recorder
 RELEASE_CHECKS = 3000  # checks after which memory that lies free is returned
 END_S = 4.5  # for everything to be written after a stop
-# The others end meanwhile on a busy computer, where the map takes long: seconds after a stop until they begin to.
-RECORDER_S, OUTPUTS_S = 2.0, 3.0
+OTHERS_S = 2.0  # after a stop: recorder and outputs end from then on, while the map still takes on a busy computer
 
 
 class InternalError(StereoSfmError):
@@ -159,7 +158,7 @@ class Service(Commands):
 
     def _close_recorder(self) -> None:
         self._pipelines.stopping.wait()
-        self._over.wait(RECORDER_S)
+        self._over.wait(OTHERS_S)
         try:
             self._recorder.close()
         finally:
@@ -167,7 +166,7 @@ class Service(Commands):
 
     def _keep_checking(self) -> None:
         tidy = Release(RELEASE_CHECKS)
-        while not self._saved.wait(CHECK_S) and self._pipelines.stopping_s < OUTPUTS_S:
+        while not self._saved.wait(CHECK_S) and self._pipelines.stopping_s < OTHERS_S:
             self._check()
             tidy.step()
         self._check()  # once more: the outputs get the final state

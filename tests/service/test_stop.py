@@ -96,8 +96,7 @@ def test_an_output_that_is_started_during_a_stop_ends(monkeypatch: pytest.Monkey
 def test_recorder_and_outputs_end_while_the_map_is_still_written(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(service, "RECORDER_S", 0.2)
-    monkeypatch.setattr(service, "OUTPUTS_S", 0.4)
+    monkeypatch.setattr(service, "OTHERS_S", 0.2)
     recorder, outputs, waited = threading.Event(), threading.Event(), list[bool]()
     config = RobotConfig(map=MapConfig(str(tmp_path / "store")))
     with Service(config, MadeSource.of(endless_wall), outputs={}) as running:
