@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import resource
 import subprocess
 import sys
 import time
@@ -29,7 +28,6 @@ from stereo_sfm.types import F64, Bool
 
 NEAR_M, CLOSE_M = 2.5, 0.05  # what is measured; of the F-score and of covered surface
 SAME_GREY = 10  # levels
-CLI = [sys.executable, "-m", "stereo_sfm.cli"]
 
 
 def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays: int) -> None:
@@ -40,8 +38,8 @@ def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays
     if not (run / "map" / "map.json").is_file():
         _call("run", spec, "-o", str(run), "--log", "full", "--inline", "-q")
     began = time.perf_counter()
-    _call("dense", str(run), "-o", str(run / "surface"), "-q")
-    took, peak = time.perf_counter() - began, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
+    peak = _call("dense", str(run), "-o", str(run / "surface"), "-q")
+    took = time.perf_counter() - began
     errors, mesh = _compared(spec, run)
     name = f"{camera}, {metres:g} m, seed {seed}"
     middle, most = 100 * np.quantile(errors, [0.5, 0.9])
@@ -55,8 +53,10 @@ def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays
     verdicts.row(f"{name}: at most 2 GB a process", peak <= 2, f"{peak:.2f} GB")
 
 
-def _call(*args: str) -> None:
-    subprocess.run([*CLI, *args], check=True)
+def _call(*args: str) -> float:
+    """Carry out a command; GB of its largest process."""
+    command = [sys.executable, str(Path(__file__).with_name("_peak.py")), *args]
+    return float(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.split()[-1]) / 1e3
 
 
 def _compared(spec: str, run: Path) -> tuple[F64, tuple[float, float, float]]:

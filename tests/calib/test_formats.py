@@ -374,7 +374,7 @@ ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
         ("rig.yaml", "stereo_sfm_rig: 1\nleft: &a {model: *a}\n", "contains itself"),
         ("rig.yaml", "stereo_sfm_rig: 1\nleft: 1" + ":1" * 50_000, "100001 characters"),
         ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (1 << 20), "no calibration"),
-        ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (5 << 20), "no calibration"),
+        ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (5 << 20), "it has 5 MB, more than 4"),
         ("basalt.json", '{"T_imu_cam": ' + "[" * 100_000, "nested too deeply"),
         (
             "stereo.yml",
