@@ -71,3 +71,13 @@ def test_the_next_replacement_begins_with_what_a_killed_one_completed(tmp_path: 
     with pytest.raises(RuntimeError), replaced_folder(folder, frozenset("a")):
         raise RuntimeError
     assert texts(folder) == {"a": ".map.partial"} and [path.name for path in tmp_path.iterdir()] == ["map"]
+
+
+@pytest.mark.parametrize("synced", [True, False])
+def test_only_what_lasts_waits_for_the_disk(synced: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    waited = list[int]()
+    monkeypatch.setattr(os, "fsync", waited.append)
+    with replaced_folder(tmp_path / "map", frozenset("a"), synced) as draft:
+        (draft / "a").write_text("new")
+    assert len(waited) == (2 if synced else 0)
+    assert texts(tmp_path / "map") == {"a": "new"}

@@ -24,7 +24,7 @@ from stereo_sfm.maps.store import lock
 from stereo_sfm.messages import MapSaved, SaveMap
 from stereo_sfm.pipeline import map_saver
 from stereo_sfm.pipeline.map_saver import MapSaver
-from stereo_sfm.service import map_keeper
+from stereo_sfm.service import map_keeper, map_store
 from stereo_sfm.service.child import end_with_service, start_child
 from stereo_sfm.service.config import MapConfig
 from stereo_sfm.service.map_keeper import ENDING, MapKeeper
@@ -263,3 +263,25 @@ def test_the_search_for_loops_rests_between_its_steps() -> None:
         time.sleep(0.5)
         assert len(growing.begun) == done
     assert np.diff(growing.begun).min() > 4 * 0.05 - 0.01
+
+
+def test_no_search_for_loops_begins_once_a_stop_has_been_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: Any = SimpleNamespace(work=lambda: steps.append(1) or True)
+    steps = list[int]()
+    for name in ("end_with_service", "raise_priority", "load_map", "configured_vocabulary"):
+        monkeypatch.setattr(map_store, name, lambda *_: None)
+    monkeypatch.setattr(map_store, "GrowingMap", lambda *_: searched)
+    monkeypatch.setattr(map_store, "_grown", lambda *_: Joined(len(steps)))
+    (requests, to_joiner), (results, answers) = (multiprocessing.Pipe(duplex=False) for _ in range(2))
+    arguments: Any = (Path(), Path(), Path(), Config(), requests, answers)
+    threading.Thread(target=map_store._keep_joined, args=arguments, daemon=True).start()  # pyright: ignore[reportPrivateUsage]
+    to_joiner.send(True)
+    results.recv()
+    while not steps:
+        time.sleep(0.01)
+    to_joiner.send(False)
+    to_joiner.send(True)
+    done = results.recv().keyframes
+    time.sleep(0.2)
+    assert len(steps) == done
+    to_joiner.close()
