@@ -39,5 +39,5 @@ class Standby:
 
     def close(self) -> None:
         """End them."""
-        self.stages.close(set())
+        self.stages.close(set(), wait=False)
         self.outer.close()

@@ -53,7 +53,7 @@ class Pipelines:
         self._mounting = RobotMounting()
         self.session: Session | None = None  # the one that runs
         self._standby: Standby | None = None  # the stages of the next one
-        self._standby_lock, self._standby_after_s, self._over = threading.Lock(), 0.0, False
+        self._standby_lock, self._standby_after_s = threading.Lock(), 0.0
         self.count = 0  # pipelines started so far
         self._restarting = False  # the pipeline is stopped to be started again
         self._failures = 0  # starts in a row that failed
@@ -72,15 +72,15 @@ class Pipelines:
         return None if self._facts.starting else self.session
 
     def check(self) -> None:
-        """Have the stages of the next pipeline wait once this one is stable; call it regularly, in one thread."""
+        """Have the stages of the next pipeline wait while this one is stable; call it regularly, also after the end."""
         session = self.session
         stable = session is not None and session.tracking_s > STABLE_S and not self.stopping.is_set()
         with self._standby_lock:
-            if self._standby is not None and not self._standby.alive:
+            if self._standby is not None and (self.stopping.is_set() or not self._standby.alive):
                 self._standby.close()
                 self._standby, self._standby_after_s = None, time.monotonic() + LONGEST_PAUSE_S
             due = self._standby is None and time.monotonic() >= self._standby_after_s
-            if session is not None and stable and due and not self._over:
+            if session is not None and stable and due:
                 self._standby = Standby(self._config, session.source.rig, session.source.modules)
 
     def _take_standby(self) -> Standby | None:
@@ -98,15 +98,6 @@ class Pipelines:
         Raises:
             StereoSfmError: a pipeline cannot be started, and another attempt would not help.
         """
-        try:
-            self._run_all()
-        finally:
-            self._over = True
-            standby = self._take_standby()
-            if standby is not None:
-                standby.close()
-
-    def _run_all(self) -> None:
         while not self.stopping.is_set():
             ended = self._run_once()
             if ended and not self._restarting:
