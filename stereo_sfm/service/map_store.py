@@ -240,6 +240,8 @@ def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests:
                 free.set()
             hurried |= not (join := requests.recv())
             free.clear()
+            if hurried:
+                raise_priority()  # there are no poses to delay any more
             if join:
                 with step:
                     send.send(Joined(why=why) if growing is None else _grown(growing, session, out))

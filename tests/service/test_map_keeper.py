@@ -265,11 +265,13 @@ def test_the_search_for_loops_rests_between_its_steps() -> None:
     assert np.diff(growing.begun).min() > 4 * 0.05 - 0.01
 
 
-def test_no_search_for_loops_begins_once_a_stop_has_been_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_was_announced_waits_for_no_search_for_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     searched: Any = SimpleNamespace(work=lambda: steps.append(1) or True)
     steps = list[int]()
-    for name in ("end_with_service", "raise_priority", "load_map", "configured_vocabulary"):
+    for name in ("end_with_service", "load_map", "configured_vocabulary"):
         monkeypatch.setattr(map_store, name, lambda *_: None)
+    raised = list[tuple[str, ...]]()
+    monkeypatch.setattr(map_store, "raise_priority", lambda *stage: raised.append(stage))
     monkeypatch.setattr(map_store, "GrowingMap", lambda *_: searched)
     monkeypatch.setattr(map_store, "_grown", lambda *_: Joined(len(steps)))
     (requests, to_joiner), (results, answers) = (multiprocessing.Pipe(duplex=False) for _ in range(2))
@@ -283,5 +285,5 @@ def test_no_search_for_loops_begins_once_a_stop_has_been_announced(monkeypatch: 
     to_joiner.send(True)
     done = results.recv().keyframes
     time.sleep(0.2)
-    assert len(steps) == done
+    assert len(steps) == done and raised[:2] == [("mapper",), ()]
     to_joiner.close()
