@@ -63,7 +63,7 @@ def _recordings(folder: Path) -> dict[str, Reply]:
         "segments": 3, "with_images": 1, "bytes": 12_000_000, "marked": True, "recording": True,
     }  # fmt: skip
     return {
-        "recordings": Reply(True, "", {"recordings": [row]}),
+        "recordings": Reply(True, "", {"recordings": [row, {**row, "id": "20261126_081233_t265", "recording": False}]}),
         "recording_files": Reply(True, "", {"files": [str(f) for f in files]}),
         "status": Reply(
             True,
@@ -150,6 +150,8 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
             browser.until("document.getElementById('plan').dataset.plan === 'shown' && plan !== null")
             assert "lost in <i>aisle 3</i>" in browser.run("document.getElementById('events').innerText")
             assert browser.run("document.documentElement.scrollWidth") <= width  # nothing hangs over the side
+            inside = "[...document.querySelectorAll('section')].every(s => s.scrollWidth <= s.clientWidth)"
+            browser.until(f"document.getElementById('recordings').innerText.includes('reindex') && {inside}", 60)
             browser.screenshot(tmp_path / "running.png")
             browser.run("document.querySelector('[data-command=save_map]').click()")
             browser.until("document.getElementById('reply').textContent === 'the disk is full'")

@@ -92,7 +92,9 @@ function showEvents(state) {
 
 function drawPlan(state) {
   const canvas = $("plan"), g = canvas.getContext("2d"), p = state.pose;
-  g.clearRect(0, 0, canvas.width, canvas.height);
+  const width = canvas.clientWidth, height = canvas.clientHeight, dots = devicePixelRatio;
+  [canvas.width, canvas.height] = [width * dots, height * dots];  // which clears it
+  g.scale(dots, dots);
   // the plan has the frame of the saved map, which is that of the poses once they are localized in it
   const s = state.status, extent = state.plan && s && p && (p.localized || s.map_is_new) ? state.plan : null;
   $("plan").dataset.plan = extent ? "shown" : "";
@@ -105,13 +107,13 @@ function drawPlan(state) {
     return [Math.min(...values), Math.max(...values)];
   };
   const [x0, x1] = range(0), [y0, y1] = range(1), margin = 24;
-  const fit = Math.min((canvas.width - 2 * margin) / Math.max(y1 - y0, 2), (canvas.height - 2 * margin) / Math.max(x1 - x0, 2));
+  const fit = Math.min((width - 2 * margin) / Math.max(y1 - y0, 2), (height - 2 * margin) / Math.max(x1 - x0, 2));
   const scale = view.scale = fit * view.zoom;
   if (view.follow && p) [view.x, view.y] = [p.x, p.y];
   const [cx, cy] = view.x === null ? [(x0 + x1) / 2, (y0 + y1) / 2] : [view.x, view.y];
   [view.cx, view.cy] = [cx, cy];
   // x forward is up, y left is left
-  const at = (x, y) => [canvas.width / 2 - (y - cy) * scale, canvas.height / 2 - (x - cx) * scale];
+  const at = (x, y) => [width / 2 - (y - cy) * scale, height / 2 - (x - cx) * scale];
   if (extent && plan) {
     g.imageSmoothingEnabled = false;
     g.drawImage(plan, ...at(extent.x, extent.y), extent.along_y * scale, extent.along_x * scale);
@@ -129,9 +131,9 @@ function drawPlan(state) {
     g.beginPath(); g.moveTo(0, -12); g.lineTo(8, 9); g.lineTo(0, 4); g.lineTo(-8, 9); g.fill(); g.restore();
   }
   const metres = [1, 2, 5, 10, 20, 50].find((m) => m * scale > 60) || 100;
-  g.strokeStyle = g.fillStyle = "#888"; g.beginPath(); g.moveTo(12, canvas.height - 12);
-  g.lineTo(12 + metres * scale, canvas.height - 12); g.stroke(); g.font = "16px system-ui";
-  g.fillText(`${metres} m`, 12, canvas.height - 18);
+  g.strokeStyle = g.fillStyle = "#888"; g.beginPath(); g.moveTo(12, height - 12);
+  g.lineTo(12 + metres * scale, height - 12); g.stroke(); g.font = "14px system-ui";
+  g.fillText(`${metres} m`, 12, height - 18);
 }
 
 function redraw() { if (last) drawPlan(last); }
@@ -158,8 +160,7 @@ function prepareView() {
   canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
   canvas.onpointermove = (event) => {
     if (!event.buttons || view.cx === undefined) return;
-    const metres = canvas.width / canvas.clientWidth / view.scale;
-    [view.x, view.y] = [view.cx + event.movementY * metres, view.cy + event.movementX * metres];
+    [view.x, view.y] = [view.cx + event.movementY / view.scale, view.cy + event.movementX / view.scale];
     follow(false);
   };
   $("zoom-in").onclick = () => zoom(1.5);
