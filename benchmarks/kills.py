@@ -76,7 +76,9 @@ def killed(service: Service, poses: Poses, stage: str) -> float:
     """Kill a stage; seconds to the next pose of another session, or of the same one where that goes on."""
     poses.more(STEADY)
     time.sleep(STEADY_S)
-    session, pid = poses.session, service.pids[stage]
+    while (pid := service.pids.get(stage)) is None:  # the pipeline was started again meanwhile
+        poses.more(STEADY)
+    session = poses.session
     began = time.monotonic()
     os.kill(pid, signal.SIGKILL)
     with poses.came:
