@@ -391,6 +391,14 @@ ATTACKS: tuple[Callable[[Target], Outcome], ...] = (
     hostile_files, many_saves, group_signal, stopped_processes,
 )  # fmt: skip
 
+TESTED = {  # what no client of a service that runs can show
+    "an output leaves shared memory": "tests/service/test_stop.py -k tidy",
+    "a tilted camera's pose climbs on a flat floor": "tests/service/test_robot_mounting.py",
+    "missing pairs change a right calibration": "tests/pipeline/test_missing_pairs.py",
+    "info finds no problem with an inverted extrinsic": "tests/commands/test_first_day.py -k inverted",
+    "a point that is seen once spoils a COLMAP export": "tests/export/test_exports.py -k seen_once",
+}
+
 
 # -- the service -------------------------------------------------------------------------------------------------------
 
@@ -481,6 +489,11 @@ def main() -> int:
     report("the service's log", f"{found} tracebacks", not found)
     for text in target.said.split(TRACEBACK)[1:]:
         print(f"{TRACEBACK}{text[:MOST_SHOWN]}")
+    for name, test in TESTED.items():
+        if args.only in name:
+            command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "", *test.split()]
+            run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+            report(name, test if run.returncode == 0 else run.stdout[-MOST_SHOWN:], run.returncode == 0)
     return sum(not closed for _, _, closed in rows)
 
 
