@@ -1,4 +1,4 @@
-"""`stereo-sfm viz`: show a run, a saved map, or any MCAP recording, in rerun."""
+"""`stereo-sfm viz`: show a run, a saved map, a surface, or any MCAP recording, in rerun."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from stereo_sfm.commands._options import add_viewer_address, typed
 from stereo_sfm.errors import StereoSfmError, require
 
+MESH = "mesh.ply"  # in a folder of `dense`
+
 if TYPE_CHECKING:
     from stereo_sfm.calib.rig import Rig
     from stereo_sfm.drivers.source import Source
@@ -23,7 +25,9 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("file", type=Path, help="run.mcap, a run's folder, a saved map, or any recording")
+    parser.add_argument(
+        "file", type=Path, help="run.mcap, a run's folder, a saved map, a folder of dense, or any recording"
+    )
     parser.add_argument("--source", help="source of the images, for a run whose log has none")
     parser.add_argument("--serve", action="store_true", help="serve the viewer to browsers instead of opening a window")
     add_viewer_address(parser)
@@ -55,18 +59,20 @@ class VizOptions:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Send a log or a saved map to the viewer; with --serve, until interrupted."""
+    """Send a log, a saved map or a surface to the viewer; with --serve, until interrupted."""
     options = typed(VizOptions, args)
     file = options.file
-    is_map = (file / "map.json").is_file()
+    is_map, is_surface = (file / "map.json").is_file(), (file / MESH).is_file()
     path = file / "run.mcap" if file.is_dir() else file
-    if not is_map and not path.exists():
-        raise StereoSfmError(f"no recording and no saved map at {file}")
+    if not is_map and not is_surface and not path.exists():
+        raise StereoSfmError(f"no recording, no saved map and no surface at {file}")
     if options.save is not None and options.save.is_file() and not options.overwrite:
         raise StereoSfmError(f"{options.save} exists: choose another name or give --overwrite")
     require(("rerun",), "viewer", "the viewer")
     if is_map:
         _show_map(options)
+    elif is_surface:
+        _show_surface(options)
     else:
         _show_log(path, options)
     if options.save is not None:
@@ -85,6 +91,19 @@ def _show_map(options: VizOptions) -> None:
     sink = options.sink(saved.rig, options.file.name)
     sink.put(as_update(saved))
     sink.close()
+
+
+def _show_surface(options: VizOptions) -> None:
+    """The mesh of `dense`."""
+    from stereo_sfm.dense.files import read_mesh
+    from stereo_sfm.viz.sink import end_recording, open_recording
+    from stereo_sfm.viz.surface import show_surface, surface_blueprint
+
+    mesh = read_mesh(options.file / MESH)
+    layout = surface_blueprint(options.file.resolve().name)
+    recording = open_recording(options.mode, layout, options.save, options.viz_address)
+    show_surface(recording, *mesh)
+    end_recording(recording, options.mode)
 
 
 def _show_log(path: Path, options: VizOptions) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,20 @@ from stereo_sfm.dense.build import ROBOT, Bands, CubeResult
 from stereo_sfm.dense.pictures import write_mesh_pictures
 from stereo_sfm.dense.surface import joined
 from stereo_sfm.dense.volume import SIDE
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, write_floor_plan
 from stereo_sfm.export.ply import write_ply
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.maps.floor import HIGH
-from stereo_sfm.types import F32, F64, I64, U8
+from stereo_sfm.types import F32, F64, I32, I64, U8
 
 LAS_HEADER, LAS_STEP = 227, 0.001  # bytes; metres
 LAS_POINT = np.dtype([
     ("xyz", "<i4", 3), ("intensity", "<u2"), ("returns", "u1"), ("class", "u1"), ("angle", "i1"), ("user", "u1"),
     ("source", "<u2"), ("colour", "<u2", 3),
 ])  # fmt: skip
+PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("colour", "u1", 3)])
+PLY_FACE = np.dtype([("n", "u1"), ("i", "<i4", 3)])
 FILES = (
     "mesh.ply, mesh.glb, cloud.ply, cloud.las, costmap.png, costmap.yaml, height.png, mesh_height.png, mesh_grey.png"
 )
@@ -44,9 +49,11 @@ def write_all(
     write_las(folder / "cloud.las", points, colours)
     for number, (low, high) in enumerate(bands):
         name = "costmap" if number == 0 else f"costmap_{low:.2f}_{high:.2f}"
-        write_floor_plan(costmap(results, voxel, map_T_floor, number), folder / name)
+        plan = costmap(results, voxel, map_T_floor, number)
+        write_floor_plan(plan, folder / name)
+        if number == 0:
+            write_heights(folder / "height.png", points, plan)
     write_mesh_pictures(folder, points, grey, triangles)
-    write_heights(folder / "height.png", points, voxel)
     area = 0.0
     if len(triangles):
         a, b, c = (points[triangles[:, i]] for i in range(3))
@@ -56,17 +63,32 @@ def write_all(
 
 def write_mesh_ply(path: Path, points: F64, colours: U8, triangles: I64) -> None:
     """Binary little-endian PLY with colours at the vertices."""
-    vertex = np.empty(len(points), [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
-    for i, name in enumerate("xyz"):
-        vertex[name] = points[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        vertex[name] = colours[:, i]
-    face = np.empty(len(triangles), [("n", "u1"), ("i", "<i4", 3)])
+    vertex = np.empty(len(points), PLY_VERTEX)
+    vertex["xyz"], vertex["colour"] = points, colours
+    face = np.empty(len(triangles), PLY_FACE)
     face["n"], face["i"] = 3, triangles
     header = ["ply", "format binary_little_endian 1.0", "comment metres", f"element vertex {len(points)}"]
     header += [f"property float {n}" for n in "xyz"] + [f"property uchar {n}" for n in ("red", "green", "blue")]
     header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]
     path.write_bytes("\n".join(header).encode() + vertex.tobytes() + face.tobytes())
+
+
+def read_mesh(path: Path) -> tuple[F32, U8, I32]:
+    """Points (V, 3) m, colours (V, 3) and triangles (T, 3) of a file of `write_mesh_ply`.
+
+    Raises:
+        StereoSfmError: another file, or a damaged one.
+    """
+    head, _, body = read_bytes(path).partition(b"end_header\n")
+    counts = [int(n) for n in re.findall(rb"element (?:vertex|face) (\d{1,10})\n", head)]
+    sizes = [n * kind.itemsize for n, kind in zip(counts, (PLY_VERTEX, PLY_FACE), strict=False)]
+    if len(counts) != 2 or len(body) != sum(sizes):
+        raise StereoSfmError(f"{path} is no mesh of 'stereo-sfm dense', or is incomplete")
+    vertex = np.frombuffer(body, PLY_VERTEX, counts[0])
+    triangles = np.frombuffer(body, PLY_FACE, counts[1], sizes[0])["i"]
+    if len(triangles) and not 0 <= triangles.min() <= triangles.max() < counts[0]:
+        raise StereoSfmError(f"{path}: triangles of points that it lacks")
+    return vertex["xyz"], vertex["colour"], triangles
 
 
 def write_glb(path: Path, points: F64, colours: U8, triangles: I64) -> None:
@@ -135,20 +157,25 @@ def costmap(results: list[CubeResult], voxel: float, map_T_floor: F64, band: int
     return FloorPlan(np.ascontiguousarray(image.T[::-1]), voxel, (origin[0], origin[1]), map_T_floor)
 
 
-def write_heights(path: Path, points: F64, voxel: float) -> None:
-    """The surface below `HIGH` from above, coloured by height: a ceiling would hide all."""
+def write_heights(path: Path, points: F64, plan: FloorPlan) -> None:
+    """The surface below `HIGH` (a ceiling would hide all) from above, coloured by height, transparent where unknown.
+
+    Its pixels are those of the costmap `plan`, so that its YAML holds for both.
+    """
     import cv2
 
     points = points[points[:, 2] < HIGH]
     if not len(points):
         return
-    low = points[:, :2].min(axis=0)
-    at = np.floor((points[:, :2] - low) / voxel).astype(np.int64)
-    size = (at.max(axis=0) + 1).tolist()
-    top: F32 = np.full(size, -np.inf, np.float32)
-    np.maximum.at(top, (at[:, 0], at[:, 1]), points[:, 2].astype(np.float32))
+    height, width = plan.image.shape
+    at = np.floor((points[:, :2] - plan.origin) / plan.resolution).astype(np.int64)
+    column, row = (
+        at[:, 0].clip(0, width - 1),
+        height - 1 - at[:, 1].clip(0, height - 1),
+    )  # vertices lie beyond by a cell
+    top: F32 = np.full((height, width), -np.inf, np.float32)
+    np.maximum.at(top, (row, column), points[:, 2].astype(np.float32))
     least, most = np.quantile(points[:, 2], [0.02, 0.98])
     share = np.clip((np.where(np.isfinite(top), top, least) - least) / max(most - least, 1e-3), 0, 1)
     picture = cv2.applyColorMap((255 * share).astype(np.uint8), cv2.COLORMAP_TURBO)
-    picture[~np.isfinite(top)] = 255
-    cv2.imwrite(str(path), np.ascontiguousarray(picture.transpose(1, 0, 2)[::-1]))
+    cv2.imwrite(str(path), np.dstack([picture, np.where(np.isfinite(top), 255, 0).astype(np.uint8)]))

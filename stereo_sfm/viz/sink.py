@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
@@ -54,6 +55,32 @@ SERIES: Mapping[str, tuple[int, int, int]] = {
 }
 
 
+def open_recording(mode: str, layout: rrb.Blueprint, path: Path | None, address: str = LOOPBACK) -> rr.RecordingStream:
+    """A recording that goes to a viewer. Args: as `RerunSink`."""
+    recording = rr.RecordingStream("stereo_sfm", recording_id=None)
+    if mode == "serve":
+        destination, said = serve(address)
+        recording.connect_grpc(destination, default_blueprint=layout)
+        print(said, file=sys.stderr, flush=True)
+    elif mode == "spawn":
+        recording.connect_grpc(open_window(), default_blueprint=layout)
+    else:
+        assert path is not None
+        path.open("ab").close()  # raises OSError if the file cannot be written, unlike rerun
+        recording.save(path, default_blueprint=layout)
+    return recording
+
+
+def end_recording(recording: rr.RecordingStream, mode: str) -> None:
+    """Send what is left and disconnect."""
+    try:
+        recording.flush(timeout_sec=1e38 if mode == "save" else GRACE_S)
+    except RuntimeError as error:
+        log.warning("the viewer does not respond, what it shows is incomplete: %s", str(error).splitlines()[0])
+    if mode == "save":
+        recording.disconnect()  # writes the end of the file
+
+
 class RerunSink:
     """Shows the messages of a run as they come."""
 
@@ -74,17 +101,7 @@ class RerunSink:
             address: to listen on with "serve".
         """
         self._mode = mode
-        self._rec = rr.RecordingStream("stereo_sfm", recording_id=None)
-        if mode == "serve":
-            destination, said = serve(address)
-            self._rec.connect_grpc(destination, default_blueprint=blueprint(name))
-            print(said, file=sys.stderr, flush=True)
-        elif mode == "spawn":
-            self._rec.connect_grpc(open_window(), default_blueprint=blueprint(name))
-        else:
-            assert path is not None
-            path.open("ab").close()  # raises OSError if the file cannot be written, unlike rerun
-            self._rec.save(path, default_blueprint=blueprint(name))
+        self._rec = open_recording(mode, blueprint(name), path, address)
         self._scene = MapScene(self._rec, rig)
         self._events = Events()
         self._images: dict[int, StereoImage] = {}  # waiting for their frame
@@ -142,12 +159,7 @@ class RerunSink:
         for frame_id in sorted(self._images):
             self._show_alone(self._images[frame_id])
         self._scene.show()
-        try:
-            self._rec.flush(timeout_sec=1e38 if self._mode == "save" else GRACE_S)
-        except RuntimeError as error:
-            log.warning("the viewer does not respond, what it shows is incomplete: %s", str(error).splitlines()[0])
-        if self._mode == "save":
-            self._rec.disconnect()  # writes the end of the file
+        end_recording(self._rec, self._mode)
 
     @_show.register
     def _text(self, line: LogLine) -> None:

@@ -21,11 +21,12 @@ from stereo_sfm.arrays import write_arrays
 from stereo_sfm.cli import main
 from stereo_sfm.dense import build as module
 from stereo_sfm.dense import inputs
-from stereo_sfm.dense.files import write_all, write_heights
+from stereo_sfm.dense.files import read_mesh, write_all, write_heights, write_mesh_ply
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
 from stereo_sfm.dense.pictures import render_mesh
 from stereo_sfm.dense.report import write_report
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.floor_plan import FloorPlan
 from stereo_sfm.geometry import se3
 from tests.dense.test_depth import render
 from tests.maps.maps import small_map
@@ -157,14 +158,34 @@ def test_a_mesh_is_drawn_from_before_and_the_nearer_face_hides_the_other() -> No
 
 
 def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
-    x, y = (a.ravel() * 0.1 for a in np.mgrid[:10, :10])
+    x, y = (a.ravel() * 0.1 + 0.05 for a in np.mgrid[:10, :10])
     below = np.stack([x, y, np.where(x < 0.5, 0.0, 1.5)], axis=1)
     ceiling = np.stack([x, y, np.full(100, 2.8)], axis=1)
+    plan = FloorPlan(np.zeros((20, 30), np.uint8), 0.1, (-1.0, -0.5), np.eye(4))
     pictures: list[Any] = []
     for points in (below, np.concatenate([below, ceiling])):
-        write_heights(tmp_path / "height.png", points, 0.1)
-        pictures.append(cv2.imread(str(tmp_path / "height.png")))
+        write_heights(tmp_path / "height.png", points, plan)
+        pictures.append(cv2.imread(str(tmp_path / "height.png"), cv2.IMREAD_UNCHANGED))
     np.testing.assert_array_equal(pictures[0], pictures[1])
+    assert pictures[0].shape == (20, 30, 4), "the pixels of the costmap"
+    known = pictures[0][..., 3] > 0
+    assert known[5:15, 10:20].all() and known.sum() == 100, "elsewhere nothing is known"
+    blue, red = pictures[0][10, 11].astype(int)[[0, 2]], pictures[0][10, 18].astype(int)[[0, 2]]
+    assert blue[0] > blue[1] and red[1] > red[0]
+
+
+def test_a_mesh_is_read_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.ply"
+    points, triangles = np.arange(12.0).reshape(4, 3), np.array([[0, 1, 2], [3, 2, 1]])
+    colours = np.arange(12, dtype=np.uint8).reshape(4, 3)
+    write_mesh_ply(path, points, colours, triangles)
+    for read, wrote in zip(read_mesh(path), (points, colours, triangles), strict=True):
+        np.testing.assert_array_equal(read, wrote)
+    whole = path.read_bytes()
+    for bad in (b"", b"ply\n", whole[:-1], whole + b"x", whole.replace(b"face 2", b"face 3"), whole[:-4] + b"\xff" * 4):
+        path.write_bytes(bad)
+        with pytest.raises(StereoSfmError):
+            read_mesh(path)
 
 
 @pytest.mark.slow  # starts two processes

@@ -18,7 +18,7 @@ import pytest
 
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.floor_plan import FREE, OCCUPIED
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan, write_floor_plan
 from stereo_sfm.geometry import se3
 from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.recording.segments import recordings, segments
@@ -75,8 +75,10 @@ def _recordings(folder: Path) -> dict[str, Reply]:
 
 
 @contextmanager
-def _serving(service: FakeService | None = None, rules: Access | None = None) -> Iterator[PageOutput]:
-    output = PageOutput("127.0.0.1", 0, 4.0, rules)
+def _serving(
+    service: FakeService | None = None, rules: Access | None = None, surface: str = ""
+) -> Iterator[PageOutput]:
+    output = PageOutput("127.0.0.1", 0, 4.0, rules, surface=surface)
     output.open(service or FakeService())
     try:
         yield output
@@ -119,7 +121,7 @@ def _plan() -> tuple[U8, float, tuple[float, float]]:
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (768, 1024), (390, 844)])
 def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path: Path) -> None:
     service = FakeService(_recordings(tmp_path))
-    with _serving(service) as output, Browser(width, height) as browser:
+    with _serving(service, surface=str(tmp_path)) as output, Browser(width, height) as browser:
         stop = threading.Event()
         told: dict[str, Any] = {"state": ServiceState.RUNNING, "reason": "", "remedy": ""}
 
@@ -148,6 +150,9 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
             output._state._take_plan(*_plan(), left_T_robot)  # pyright: ignore[reportPrivateUsage]
             told.update(map_is_new=True)
             browser.until("document.getElementById('plan').dataset.plan === 'shown' && plan !== null")
+            _surface(tmp_path)
+            browser.run("refresh()")
+            browser.until("document.getElementById('plan').dataset.surface === 'shown'")
             assert "lost in <i>aisle 3</i>" in browser.run("document.getElementById('events').innerText")
             assert browser.run("document.documentElement.scrollWidth") <= width  # nothing hangs over the side
             inside = "[...document.querySelectorAll('section')].every(s => s.scrollWidth <= s.clientWidth)"
@@ -270,6 +275,44 @@ def test_the_floor_plan_is_in_the_axes_of_the_poses() -> None:
     assert pixel(2.8, 0.25) == [60, 50, 40, 255]  # the shelf
     assert pixel(1.0, 0.25) == pixel(2.8, 0.75) == [255, 255, 255, 255]
     assert image.shape[0] * 0.05 == pytest.approx(extent["along_x"])
+
+
+def _surface(folder: Path, height: int = 20, width: int = 30) -> None:
+    """What `dense` writes: 10 cm a pixel, red at x 1 ... 1.5, y 0.4 ... 0.9 of the robot's map."""
+    picture = np.zeros((height, width, 4), np.uint8)
+    picture[-10:-5, 15:20] = (0, 0, 255, 255)
+    left_T_robot = se3.inverse(RobotAxes(started().rig).base_T_left)
+    plan = FloorPlan(np.zeros((height, width), np.uint8), 0.1, (-0.5, -0.1), left_T_robot)
+    write_floor_plan(plan, folder / "costmap")
+    cv2.imwrite(str(folder / "height.png"), picture)
+
+
+def test_a_surface_lies_under_the_map(tmp_path: Path) -> None:
+    with _serving(surface=str(tmp_path)) as output:
+        assert _ask(output, "GET", "/api/surface")[0] == 204, "no camera yet"
+        output.put(started())
+        assert _ask(output, "GET", "/api/surface")[0] == _ask(output, "GET", "/api/surface.png")[0] == 204
+        _surface(tmp_path)
+        extent = json.loads(_ask(output, "GET", "/api/surface")[1])
+        code, data, headers = _ask(output, "GET", "/api/surface.png")
+        _surface(tmp_path, 2400, 5000)
+        large = json.loads(_ask(output, "GET", "/api/surface")[1])
+        reduced = cv2.imdecode(np.frombuffer(_ask(output, "GET", "/api/surface.png")[1], np.uint8), -1)
+        assert reduced is not None
+        for bad in (b"", b"no: [picture"):
+            (tmp_path / "costmap.yaml").write_bytes(bad)
+            (tmp_path / "height.png").touch()
+            assert _ask(output, "GET", "/api/surface")[0] == 204
+    assert code == 200 and headers["content-type"] == "image/png"
+    image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+
+    def pixel(x: float, y: float) -> list[int]:
+        return image[int((extent["x"] - x) / 0.1), int((extent["y"] - y) / 0.1)].tolist()
+
+    assert pixel(1.05, 0.45) == pixel(1.45, 0.85) == [0, 0, 255, 255]
+    assert pixel(1.05, 0.3) == pixel(1.6, 0.65) == [0, 0, 0, 0]
+    assert extent["version"] != large["version"] and max(np.shape(reduced)) <= 2048
+    assert large["along_x"] == pytest.approx(500, abs=1)
 
 
 def test_recordings_have_the_verdict_of_info(tmp_path: Path) -> None:
@@ -468,6 +511,8 @@ def test_nothing_is_sent_without_the_token() -> None:
             "/api/map",
             "/api/image.jpg",
             "/api/floor_plan.png",
+            "/api/surface",
+            "/api/surface.png",
             "/api/recordings",
             "/api/recordings/r1/0",
             "/api/settings",

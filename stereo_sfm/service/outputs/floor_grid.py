@@ -40,12 +40,26 @@ def aligned(image: U8, resolution: float, origin: tuple[float, float], map_T_flo
     """Turn a floor plan into the axes of the map: Nav2 takes no grid that is turned.
 
     Args:
-        image: (H, W) FREE, OCCUPIED, UNKNOWN; the last row has the least y.
+        image: (H, W) FREE, OCCUPIED, UNKNOWN; the rest as `turned`.
+    """
+    flat, start = turned(image, resolution, origin, map_T_floor, UNKNOWN)
+    cells = np.full(flat.shape, -1, np.int8)
+    for grey, value in CELLS.items():
+        cells[flat == grey] = value
+    return FloorGrid(cells, resolution, start)
+
+
+def turned(image: U8, resolution: float, origin: tuple[float, float], map_T_floor: F64, border: int) -> tuple[U8, F64]:
+    """A picture from above in the axes of the map, the first row with the least y; its corner with the least x and y.
+
+    Args:
+        image: (H, W) or (H, W, C); the last row has the least y.
         resolution: metres per pixel.
         origin: metres, corner with the least x and y in the floor's frame.
         map_T_floor: (4, 4) the floor in the robot's map.
+        border: around it.
     """
-    height, width = image.shape
+    height, width = image.shape[:2]
     size = np.array([width, height]) * resolution
     corners = np.array([[origin[0] + x, origin[1] + y, 0.0] for x in (0.0, size[0]) for y in (0.0, size[1])])
     outline = se3.transform(map_T_floor, corners)
@@ -57,12 +71,9 @@ def aligned(image: U8, resolution: float, origin: tuple[float, float], map_T_flo
     into_floor = np.column_stack([turn, start / resolution + (turn.sum(1) - 1) / 2])
     flat = cv2.warpAffine(
         image[::-1], into_floor, (int(columns), int(rows)), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-        borderValue=UNKNOWN,
+        borderValue=[border] * 4,
     )  # fmt: skip
-    cells = np.full(flat.shape, -1, np.int8)
-    for grey, value in CELLS.items():
-        cells[flat == grey] = value
-    return FloorGrid(cells, resolution, np.array([*low, outline[:, 2].mean()]))
+    return flat.astype(np.uint8), np.array([*low, outline[:, 2].mean()])
 
 
 class FloorGrids:

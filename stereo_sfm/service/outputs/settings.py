@@ -51,6 +51,7 @@ class PageConfig:
     address: str = line("127.0.0.1", "Address to listen on")
     port: int = number(8080, 1, 65535, "Port to listen on")
     picture_hz: float = number(4.0, 0, 30, "Images a second")
+    surface: str = path("Folder of `dense` for the saved map, whose picture from above lies under the map")
 
 
 @dataclass(frozen=True)

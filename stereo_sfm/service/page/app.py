@@ -28,6 +28,7 @@ from stereo_sfm.service.outputs.guard import Guard, refusal
 from stereo_sfm.service.page import playback
 from stereo_sfm.service.page.settings_form import settings_form
 from stereo_sfm.service.page.state import PageState
+from stereo_sfm.service.page.surface import SurfacePicture, SurfacePictures
 from stereo_sfm.service.page.verdicts import Verdicts
 from stereo_sfm.service.publisher import Reply, ServiceClient
 
@@ -56,9 +57,15 @@ T = TypeVar("T")
 class Page:
     """The handlers of the page."""
 
-    def __init__(self, state: PageState, service: ServiceClient, rules: Access, guard: Guard) -> None:
-        """Args: state, what is shown. service: carries out commands. rules: who may connect. guard: before it."""
+    def __init__(
+        self, state: PageState, service: ServiceClient, rules: Access, guard: Guard, surface: str = ""
+    ) -> None:
+        """Args:
+        state: what is shown. service: carries out commands. rules: who may connect. guard: before it.
+        surface: folder of `dense`, if any.
+        """
         self._state, self._service, self._rules, self._guard = state, service, rules, guard
+        self._surfaces = SurfacePictures(Path(surface)) if surface else None
         self._links = Links(rules.token) if rules.token else None
         self._sessions: dict[str, float] = {}  # id -> until when
         self._commands = Bucket(5, 20)
@@ -72,6 +79,8 @@ class Page:
             ("/api/map", self._map),
             ("/api/image.jpg", self._image),
             ("/api/floor_plan.png", self._floor_plan),
+            ("/api/surface", self._surface),
+            ("/api/surface.png", self._surface_png),
             ("/api/settings", self._settings),
             ("/api/recordings", self._recordings),
             ("/api/recordings/{id}", self._files),
@@ -150,6 +159,19 @@ class Page:
     async def _floor_plan(self, request: Request) -> Response:
         data = self._state.floor_plan()
         return Response(data, media_type="image/png") if data else Response(status_code=204)
+
+    async def _surface(self, request: Request) -> Response:
+        found = await self._newest_surface()
+        return Response(status_code=204) if found is None else JSONResponse(found.extent)
+
+    async def _surface_png(self, request: Request) -> Response:
+        found = await self._newest_surface()
+        return Response(status_code=204) if found is None else Response(found.png, media_type="image/png")
+
+    async def _newest_surface(self) -> SurfacePicture | None:
+        if self._surfaces is None or self._state.axes is None:
+            return None
+        return await run_in_threadpool(self._surfaces.newest, self._state.axes)
 
     async def _settings(self, request: Request) -> Response:
         reply = await self._call("status", {})

@@ -20,7 +20,8 @@ def make(config: RobotConfig) -> PageOutput:
     """The output."""
     require(("starlette", "uvicorn", "websockets"), "serve", "the operator's page")
     page = config.page
-    return PageOutput(page.address, page.port, page.picture_hz, access(config.security, page.address), config.security)
+    rules = access(config.security, page.address)
+    return PageOutput(page.address, page.port, page.picture_hz, rules, config.security, page.surface)
 
 
 class PageOutput:
@@ -35,12 +36,18 @@ class PageOutput:
         preview_hz: float,
         rules: Access | None = None,
         security: SecurityConfig | None = None,
+        surface: str = "",
     ) -> None:
-        """Args: address and port, where to listen. preview_hz: images a second. rules, security: for who connects."""
+        """Listen at `open`.
+
+        Args:
+            address, port: where. preview_hz: images a second. rules, security: for who connects.
+            surface: folder of `dense`, if any.
+        """
         from stereo_sfm.service.page.state import PageState
 
         self.preview_hz, self._rules = preview_hz, rules or Access()
-        self._state = PageState()
+        self._state, self._surface = PageState(), surface
         self._web = WebServer("page", address, port, self._rules, security or SecurityConfig())
 
     @property
@@ -56,7 +63,7 @@ class PageOutput:
         """
         from stereo_sfm.service.page.app import Page
 
-        self._web.open(lambda guard: Page(self._state, service, self._rules, guard).app())
+        self._web.open(lambda guard: Page(self._state, service, self._rules, guard, self._surface).app())
 
     def put(self, message: ServiceMessage) -> None:
         """Show a message."""

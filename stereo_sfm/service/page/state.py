@@ -101,6 +101,11 @@ class PageState:
             version = self._values["plan"]["version"] + 1 if self._values["plan"] else 1
             self._plan_png, self._values["plan"] = _plan_png(grid), {"version": version, **_plan_extent(grid)}
 
+    @property
+    def axes(self) -> RobotAxes | None:
+        """Of the camera; None before the start."""
+        return self._axes
+
     def floor_plan(self) -> bytes:
         """The floor plan as PNG, x up and y to the left, where `plan` of the snapshot says; empty at first."""
         return self._plan_png

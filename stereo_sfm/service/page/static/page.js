@@ -3,7 +3,7 @@ const $ = (id) => document.getElementById(id);
 const show = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
 const number = (value, digits = 1) => value === null || value === undefined ? "–" : Number(value).toFixed(digits);
 const STATES = { running: "good", starting: "warn", lost: "bad", camera_gone: "bad", disk_full: "warn", stopping: "warn" };
-let plan = null, planVersion = 0;
+let plan = null, planVersion = 0, surface = null;  // pictures under the map
 const view = { zoom: 1, x: null, y: null, follow: false, scale: 1 };  // of the plan; centre null: the whole map
 const HISTORY_S = 300, history_ = [];  // what the small plots show, one entry a second
 let live = null, map = { version: 0, points: [], path: [] }, last = null, receivedAt = 0, commands = 0;
@@ -118,6 +118,9 @@ function drawPlan(state) {
     g.imageSmoothingEnabled = false;
     g.drawImage(plan, ...at(extent.x, extent.y), extent.along_y * scale, extent.along_x * scale);
   }
+  const under = surface && s && p && (p.localized || s.map_is_new) ? surface : null;
+  canvas.dataset.surface = under ? "shown" : "";
+  if (under) g.drawImage(under.image, ...at(under.x, under.y), under.along_y * scale, under.along_x * scale);
   for (const [x, y, z] of map.points) {
     g.fillStyle = `hsl(${Math.max(0, Math.min(240, 200 - 80 * z))} 60% 50%)`;
     g.fillRect(...at(x, y), 2, 2);
@@ -213,6 +216,15 @@ function refreshPlan(extent) {
   loaded.src = `api/floor_plan.png?version=${extent.version}`;
 }
 
+async function refreshSurface() {
+  const response = await request("api/surface"), found = response.status === 200 ? await response.json() : null;
+  if (!found) surface = null;
+  if (!found || (surface && surface.version === found.version)) return;
+  const image = new Image();
+  image.onload = () => { surface = { ...found, image }; };
+  image.src = `api/surface.png?version=${found.version}`;
+}
+
 async function refreshMap(version) {
   if (version !== map.version) map = await (await request("api/map")).json();
 }
@@ -275,6 +287,7 @@ function preparePlayer() {
 
 async function refresh() {
   try {
+    await refreshSurface();
     const rows = await (await request("api/recordings")).json(), table = document.createElement("table");
     table.id = "recordings";
     for (const r of Array.isArray(rows) ? rows : []) {
