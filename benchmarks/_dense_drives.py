@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from stereo_sfm.dense.build import read_depth
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import find_input, keyframes
-from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, partner, shows_more
 from stereo_sfm.dense.views import stereo_view
 from stereo_sfm.drivers.sim.kernels import FACING
 from stereo_sfm.drivers.sim.render import Renderer
@@ -129,7 +129,7 @@ def real(verdicts: Verdicts, folder: Path, name: str, spec: str, most: int, sgbm
     for now in keyframes(find_input(run)):
         if last is None or shows_more(last, now):
             if last is not None and last.right is not None:
-                agree.append(_agreements(last, earlier(recent, last), now, sgbm))
+                agree.append(_agreements(last, partner(recent, last), now, sgbm))
             last = now
         recent.append(now)
         if len(agree) == most:
@@ -141,7 +141,7 @@ def real(verdicts: Verdicts, folder: Path, name: str, spec: str, most: int, sgbm
 
 def _agreements(now: KeyframeImages, before: KeyframeImages | None, after: KeyframeImages, sgbm: Any) -> Bool:
     """(2, N) of the pixels that both predict: whether the next image is as bright where each of both puts it."""
-    ours = keyframe_depth(now, before)
+    ours = keyframe_depth(now, [before] if before is not None else [])  # not of the image that is predicted
     assert ours is not None and now.right is not None
     scale = 640 / max(now.rig.left.size)
     view = stereo_view(now.rig, min(1.0, scale))

@@ -22,7 +22,7 @@ from stereo_sfm.arrays import read_arrays, write_arrays
 from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
-from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, with_partners
 from stereo_sfm.dense.surface import LEAST_VIEWS, Surface, extract
 from stereo_sfm.dense.volume import SIDE, Seen, contributes, cubes_of, fuse, touched
 from stereo_sfm.errors import StereoSfmError
@@ -34,7 +34,7 @@ from stereo_sfm.types import F64, U8, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "4"  # of the files: grows when the same input gives other bits
+VERSION = "5"  # of the files: grows when the same input gives other bits
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
@@ -143,18 +143,12 @@ def _depths(
     floor_T_map, sessions, count = se3.inverse(map_T_floor), given.saved.sessions, len(given.saved)
 
     def tasks() -> Iterator[Any]:
-        recent: deque[KeyframeImages] = deque(maxlen=16)  # more keyframes are too far away
-        last: KeyframeImages | None = None  # with depth
-        for now in keyframes(given):
-            if recent and sessions[recent[-1].number] != sessions[now.number]:
-                recent.clear()
-                last = None
-            if last is None or shows_more(last, now):
-                last, place = now, floor_T_map @ now.map_T_cam
-                yield now, earlier(recent, now), folder, voxel, place, int(sessions[now.number])
-            else:
+        for found in with_partners(keyframes(given), sessions):
+            if found is None:
                 yield None
-            recent.append(now)
+                continue
+            now, others = found
+            yield now, others, folder, voxel, floor_T_map @ now.map_T_cam, int(sessions[now.number])
 
     kept: list[KeptDepth] = []
     for number, result in enumerate(workers.map(_depth, tasks()), 1):
@@ -166,11 +160,11 @@ def _depths(
 def _depth(task: Any) -> KeptDepth | None:
     if task is None:  # a keyframe that shows what another showed
         return None
-    now, before, folder, voxel, floor_T_cam, session = task
-    path, key = folder / f"{now.number:06d}.npz", _depth_key(now, before)
+    now, others, folder, voxel, floor_T_cam, session = task
+    path, key = folder / f"{now.number:06d}.npz", _depth_key(now, others)
     found = read_depth(path, key)
     if found is None:
-        found = keyframe_depth(now, before)
+        found = keyframe_depth(now, others)
         if found is None:
             return None
         _write(path, key, _depth_columns(found))
@@ -178,14 +172,14 @@ def _depth(task: Any) -> KeptDepth | None:
     return KeptDepth(path, key, floor_T_cam, session, seen.reach(voxel), tuple(sorted(touched(seen, voxel))))
 
 
-def _depth_key(now: KeyframeImages, before: KeyframeImages | None) -> str:
-    """Of the images, the cameras and the motion between, to a hundredth of a millimetre: less moves no disparity."""
+def _depth_key(now: KeyframeImages, others: list[KeyframeImages]) -> str:
+    """Of the images, the cameras and the motions between, to a hundredth of a millimetre: less moves no disparity."""
     digest = hashlib.sha256(VERSION.encode())
-    for part in (now.left, now.right, None if before is None else before.left):
+    for part in (now.left, now.right, *(other.left for other in others)):
         digest.update(b"-" if part is None else part.tobytes())
     digest.update(rig_to_text(now.rig).encode())
-    if before is not None:
-        motion = se3.inverse(now.map_T_cam) @ before.map_T_cam
+    for other in others:
+        motion = se3.inverse(now.map_T_cam) @ other.map_T_cam
         digest.update(np.rint(motion * 1e5).astype(np.int64).tobytes())
     return digest.hexdigest()
 

@@ -6,7 +6,6 @@ Depth is along the optical axis, 0 where unknown; normals are in the camera's fr
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
-from stereo_sfm.dense.keyframe_depth import VIEW_PX, KeyframeImages, earlier, keyframe_depth, seen_in, shows_more
+from stereo_sfm.dense.keyframe_depth import VIEW_PX, KeyframeImages, keyframe_depth, seen_in, with_partners
 from stereo_sfm.dense.live import ahead
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap, image_names
@@ -29,7 +28,6 @@ from stereo_sfm.types import F32, F64, U8
 
 KIND = "geometric"  # COLMAP's word for depth that several images agree on
 NEIGHBOURS = 20  # images that fusion compares with each: COLMAP's default
-RECENT = 16  # keyframes that may be near enough for motion stereo
 
 
 def export_colmap_dense(given: DenseInput, folder: Path, report: Callable[[int, int], None] = lambda *_: None) -> int:
@@ -41,19 +39,11 @@ def export_colmap_dense(given: DenseInput, folder: Path, report: Callable[[int, 
     saved = given.saved
     names = image_names(saved, "left")
     chosen: list[int] = []
-    recent: deque[KeyframeImages] = deque(maxlen=RECENT)
-    last: KeyframeImages | None = None
-    for count, now in enumerate(keyframes(given), 1):
-        if recent and saved.sessions[recent[-1].number] != saved.sessions[now.number]:
-            recent.clear()
-            last = None
-        if last is None or shows_more(last, now):
-            last = now
-            depth = keyframe_depth(now, earlier(recent, now))
-            if depth is not None:
-                _write_view(folder, names[now.number], now, depth)
-                chosen.append(now.number)
-        recent.append(now)
+    for count, found in enumerate(with_partners(keyframes(given), saved.sessions), 1):
+        if found is not None and (depth := keyframe_depth(*found)) is not None:
+            now = found[0]
+            _write_view(folder, names[now.number], now, depth)
+            chosen.append(now.number)
         report(count, len(saved))
     if not chosen:
         raise StereoSfmError("no keyframe has depth: one camera needs keyframes 10 to 40 cm apart")

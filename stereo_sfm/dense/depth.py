@@ -8,7 +8,7 @@ import numpy as np
 
 from stereo_sfm.dense.matching import AGREE_PX, agreeing, match_both_ways
 from stereo_sfm.dense.noise import learned_sigmas
-from stereo_sfm.dense.refinement import refine
+from stereo_sfm.dense.refinement import RADIUS, refine
 from stereo_sfm.dense.surface_mean import SUPPORT, surface_means
 from stereo_sfm.dense.views import PairView
 from stereo_sfm.geometry.cameras import Camera
@@ -46,7 +46,8 @@ def disparities(left: U8, right: U8, count: int, step: int = 1) -> tuple[F32, F3
         other = np.ascontiguousarray(other[:, ::-1])
         found = agreeing(found, other, AGREE_PX)
     predicted = np.where(np.isfinite(found), predicted, np.nan).astype(np.float32)
-    found, predicted = surface_means(found, predicted, step)
+    single = np.maximum(predicted, learned_sigmas(found, predicted, -(-(2 * RADIUS + 1) // step)))
+    found, predicted = surface_means(found, single, step)
     return found, learned_sigmas(found, predicted, -(-SUPPORT // step))
 
 

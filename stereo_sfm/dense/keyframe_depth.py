@@ -1,10 +1,12 @@
-"""Depth of a keyframe: of its pair, and of the motion from an earlier keyframe, joined by their variances."""
+"""Depth of a keyframe: of its pair, and of the motion from an earlier one and to a later one, joined by variances."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import chain, groupby, repeat
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from stereo_sfm.dense.depth import DepthImage, pair_depth
 from stereo_sfm.dense.views import PairView, motion_view, stereo_view
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F32, F64, U8
+from stereo_sfm.types import F32, F64, I64, U8
 
 MOTION_M = (
     0.1,
@@ -23,6 +25,7 @@ BEST_M = 0.3
 VIEW_PX = 640  # longest side of a view: finer ones cost more than a voxel of 2 cm shows
 STEP = 2  # px of a view between depths: a voxel of 2 cm at 2.5 m and 200 px a radian
 AGREE_SIGMAS = 3.0
+AROUND = 16  # keyframes before and after one that may be `MOTION_M` apart
 SPACING_M, SPACING_DEG = 0.25, 15.0  # between keyframes with depth: a shelf 1 m away is still seen by several
 
 
@@ -37,7 +40,38 @@ class KeyframeImages:
     right: U8 | None
 
 
-def earlier(keyframes: Sequence[KeyframeImages], now: KeyframeImages) -> KeyframeImages | None:
+def with_partners(
+    frames: Iterable[KeyframeImages], sessions: I64
+) -> Iterator[tuple[KeyframeImages, list[KeyframeImages]] | None]:
+    """Each keyframe with an earlier and a later one to match; None for one that shows what another showed.
+
+    What one of them cannot see behind an edge the other often can, and of three depths two can outvote the third.
+    """
+    for _, visit in groupby(frames, lambda k: int(sessions[k.number])):
+        last: KeyframeImages | None = None
+        for past, now, coming in _around(visit):
+            if last is not None and not shows_more(last, now):
+                yield None
+                continue
+            last = now
+            yield now, [k for k in (partner(past, now), partner(coming, now)) if k is not None]
+
+
+def _around(
+    visit: Iterable[KeyframeImages],
+) -> Iterator[tuple[Sequence[KeyframeImages], KeyframeImages, Sequence[KeyframeImages]]]:
+    past: deque[KeyframeImages] = deque(maxlen=AROUND)
+    coming: deque[KeyframeImages] = deque()
+    for one in chain(visit, repeat(None, AROUND)):
+        if one is not None:
+            coming.append(one)
+        if coming and (one is None or len(coming) > AROUND):
+            now = coming.popleft()
+            yield past, now, coming
+            past.append(now)
+
+
+def partner(keyframes: Sequence[KeyframeImages], now: KeyframeImages) -> KeyframeImages | None:
     """The keyframe whose distance is nearest to `BEST_M`, None where none is `MOTION_M` apart."""
     apart = [float(np.linalg.norm(k.map_T_cam[:3, 3] - now.map_T_cam[:3, 3])) for k in keyframes]
     good = [i for i, d in enumerate(apart) if MOTION_M[0] <= d <= MOTION_M[1]]
@@ -51,23 +85,21 @@ def shows_more(last: KeyframeImages, now: KeyframeImages) -> bool:
     return bool(turned or np.linalg.norm(moved[:3, 3]) >= SPACING_M)
 
 
-def keyframe_depth(now: KeyframeImages, before: KeyframeImages | None) -> DepthImage | None:
+def keyframe_depth(now: KeyframeImages, others: Iterable[KeyframeImages]) -> DepthImage | None:
     """Depth of a keyframe's left camera; None where there is one camera and no motion.
 
     Every `STEP`-th pixel is refined, of the left images alone: other keyframes tell gross errors.
     """
-    rig, pair = now.rig, None
+    rig, found = now.rig, list[DepthImage]()
     scale = min(1.0, VIEW_PX / max(rig.left.size))
     if rig.second_camera is not None and now.right is not None:
-        pair = pair_depth(_pair_view(rig, scale), now.left, now.right, STEP)
-    if before is None:
-        return pair
-    now_T_before = se3.inverse(now.map_T_cam) @ before.map_T_cam
-    view = motion_view(rig.left, before.rig.left, now_T_before, scale * rig.left.fx)
-    if view is None:
-        return pair
-    moved = pair_depth(view, now.left, before.left, STEP)
-    return moved if pair is None else joined(pair, moved)
+        found.append(pair_depth(_pair_view(rig, scale), now.left, now.right, STEP))
+    for other in others:
+        now_T_other = se3.inverse(now.map_T_cam) @ other.map_T_cam
+        view = motion_view(rig.left, other.rig.left, now_T_other, scale * rig.left.fx)
+        if view is not None:
+            found.append(pair_depth(view, now.left, other.left, STEP))
+    return joined(found) if found else None
 
 
 @lru_cache(4)
@@ -75,21 +107,26 @@ def _pair_view(rig: Rig, scale: float) -> PairView:
     return stereo_view(rig, scale)
 
 
-def joined(first: DepthImage, second: DepthImage) -> DepthImage:
-    """Both in the view of the first: means by variance where they agree, nothing where they contradict each other.
+def joined(images: Sequence[DepthImage]) -> DepthImage:
+    """All in the view of the first: means by variance of what most agree on, nothing where they contradict each other.
 
     Ranges are compared by their inverses, whose errors are alike near and far.
     """
-    ranges, sigmas = seen_in(first, second)
-    a, b = 1 / first.ranges, 1 / ranges
-    va, vb = np.square(first.sigmas * a * a), np.square(sigmas * b * b)
-    agree = np.abs(a - b) <= AGREE_SIGMAS * np.sqrt(va + vb)
-    mean, variance = (a * vb + b * va) / (va + vb), va * vb / (va + vb)
-    both = np.isfinite(a) & np.isfinite(b)
-    inverse = np.where(both, np.where(agree, mean, np.nan), np.where(np.isfinite(a), a, b))
-    spread = np.sqrt(np.where(both, variance, np.where(np.isfinite(a), va, vb)))
-    out = 1 / inverse
-    return replace(first, ranges=out.astype(np.float32), sigmas=(spread * out * out).astype(np.float32))
+    first = images[0]
+    measured = [(first.ranges, first.sigmas), *(seen_in(first, other) for other in images[1:])]
+    inverse = np.stack([1 / ranges for ranges, _ in measured])
+    variance = np.stack([np.square(sigmas / ranges**2) for ranges, sigmas in measured])
+    apart = np.square(inverse[:, None] - inverse)  # (N, N, H, W)
+    agree = apart <= AGREE_SIGMAS**2 * (variance[:, None] + variance)
+    weight = np.nan_to_num(1 / variance)
+    known = (agree * weight).sum(axis=1)  # by those that agree with each
+    chosen = np.take_along_axis(agree, known.argmax(axis=0)[None, None], axis=0)[0]
+    total = (chosen * weight).sum(axis=0)
+    most = 2 * chosen.sum(axis=0) > np.isfinite(inverse).sum(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out = np.where(most, total / (chosen * weight * np.nan_to_num(inverse)).sum(axis=0), np.nan)
+        sigmas = out * out / np.sqrt(total)
+    return replace(first, ranges=out.astype(np.float32), sigmas=sigmas.astype(np.float32))
 
 
 def seen_in(view: DepthImage, other: DepthImage) -> tuple[F32, F32]:

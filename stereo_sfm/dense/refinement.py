@@ -25,6 +25,7 @@ SAME_SURFACE = 1.5  # px of disparity from the middle's within which a pixel tak
 FLAT_PX2 = 0.3  # added to the spread of x and of y (a window's: 6.7), so that few values in a row give no slope across
 UNKNOWN_WEIGHT = 0.05  # of pixels without disparity: mostly occluded, but they may be all that there is
 ITERATIONS = 6
+FITS = 3  # of a plane, reweighed: the first one's weights are those of a flat one, so that a step makes no slope
 FARTHEST = 1.5  # px from the start: beyond, another match was found
 LEAST_GRADIENT = 0.03  # grey levels a pixel, root mean square in a window: below, rounding decides
 MATCH_PX = 1.5  # px, standard deviation of the matcher's disparity: holds windows with hardly any texture
@@ -61,25 +62,29 @@ def plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd):
 
 @inner
 def _slopes(disparity, u, v):
-    """Slopes of the disparity along columns and rows around a pixel, by least squares over its surface."""
-    n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
+    """Slopes of the disparity along columns and rows around a pixel, by robust least squares over its surface."""
+    a = b = c = 0.0
     middle = disparity[v, u]
-    for dy in range(-RADIUS, RADIUS + 1):
-        for dx in range(-RADIUS, RADIUS + 1):
-            q = disparity[v + dy, u + dx] - middle
-            if not abs(q) <= SAME_SURFACE:
-                continue
-            n += 1.0
-            sx += dx
-            sy += dy
-            sxx += dx * dx
-            syy += dy * dy
-            sxy += dx * dy
-            sd += q
-            sxd += dx * q
-            syd += dy * q
-    found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
-    return found[0], found[1]
+    for _ in range(FITS):
+        n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
+        for dy in range(-RADIUS, RADIUS + 1):
+            for dx in range(-RADIUS, RADIUS + 1):
+                q = disparity[v + dy, u + dx] - middle
+                if not abs(q) <= SAME_SURFACE:
+                    continue
+                off = (q - c - a * dx - b * dy) / ON_PLANE
+                k = 1.0 / (1.0 + off * off) ** 2
+                n += k
+                sx += k * dx
+                sy += k * dy
+                sxx += k * dx * dx
+                syy += k * dy * dy
+                sxy += k * dx * dy
+                sd += k * q
+                sxd += k * dx * q
+                syd += k * dy * q
+        a, b, c, _ = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
+    return a, b
 
 
 @njit

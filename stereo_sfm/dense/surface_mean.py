@@ -14,11 +14,12 @@ import math
 
 import numpy as np
 
-from stereo_sfm.dense.refinement import RADIUS, SAME_SURFACE, plane_through
+from stereo_sfm.dense.refinement import FITS, RADIUS, SAME_SURFACE, plane_through
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F32
 
 RINGS = 2  # of windows around the middle's; a window overlaps the next by half
+WIDTH = 2.0  # standard deviations from the plane at which a window's weight falls to a quarter
 SUPPORT = 2 * (RINGS + 1) * RADIUS + 1  # px, side of what takes part
 
 
@@ -43,28 +44,33 @@ def _means(disparity, sigma, pitch):
             middle = disparity[v, u]
             if math.isnan(middle):
                 continue
-            n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
-            for y in range(v - reach, v + reach + 1, pitch):
-                if y < 0 or y >= h:
-                    continue
-                for x in range(u - reach, u + reach + 1, pitch):
-                    if x < 0 or x >= w:
+            a = b = c = variance = 0.0
+            own = sigma[v, u] * sigma[v, u]
+            for _ in range(FITS):
+                n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
+                for y in range(v - reach, v + reach + 1, pitch):
+                    if y < 0 or y >= h:
                         continue
-                    q = disparity[y, x] - middle
-                    if not abs(q) <= SAME_SURFACE:
-                        continue
-                    k = 1.0 / (sigma[y, x] * sigma[y, x])
-                    dx, dy = x - u, y - v
-                    n += k
-                    sx += k * dx
-                    sy += k * dy
-                    sxx += k * dx * dx
-                    syy += k * dy * dy
-                    sxy += k * dx * dy
-                    sd += k * q
-                    sxd += k * dx * q
-                    syd += k * dy * q
-            found = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
-            out[v, u] = middle + found[2]
-            spread[v, u] = math.sqrt(found[3])
+                    for x in range(u - reach, u + reach + 1, pitch):
+                        if x < 0 or x >= w:
+                            continue
+                        q = disparity[y, x] - middle
+                        if not abs(q) <= SAME_SURFACE:
+                            continue
+                        dx, dy, square = x - u, y - v, sigma[y, x] * sigma[y, x]
+                        off = q - c - a * dx - b * dy
+                        fits = 1.0 + off * off / (WIDTH * WIDTH * (own + square))
+                        k = 1.0 / (square * fits * fits)
+                        n += k
+                        sx += k * dx
+                        sy += k * dy
+                        sxx += k * dx * dx
+                        syy += k * dy * dy
+                        sxy += k * dx * dy
+                        sd += k * q
+                        sxd += k * dx * q
+                        syd += k * dy * q
+                a, b, c, variance = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
+            out[v, u] = middle + c
+            spread[v, u] = math.sqrt(variance)
     return out, spread

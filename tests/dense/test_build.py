@@ -22,7 +22,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.dense import build as module
 from stereo_sfm.dense import inputs
 from stereo_sfm.dense.files import read_mesh, write_all, write_heights, write_mesh_ply
-from stereo_sfm.dense.keyframe_depth import KeyframeImages, earlier, keyframe_depth, shows_more
+from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, partner, shows_more, with_partners
 from stereo_sfm.dense.pictures import render_mesh
 from stereo_sfm.dense.report import write_report
 from stereo_sfm.errors import StereoSfmError
@@ -207,16 +207,23 @@ def reversed_args(built: Any, folder: Path) -> tuple[Any, ...]:
 
 def test_one_camera_has_depth_from_motion_alone() -> None:
     frames = drive(2, right=False)
-    assert keyframe_depth(frames[0], None) is None
-    before = earlier(frames[:1], frames[1])
+    assert keyframe_depth(frames[0], []) is None
+    before = partner(frames[:1], frames[1])
     assert before is frames[0]
-    depth = keyframe_depth(frames[1], before)
+    depth = keyframe_depth(frames[1], [before])
     assert depth is not None
     points = depth.points()
     sides = points[np.isfinite(points[..., 0]) & (points[..., 2] < 1.75) & (np.abs(points[..., 0]) > 0.8)]
     assert len(sides) > 300
     off = np.minimum(np.abs(sides[:, 0] + 1.0), np.abs(sides[:, 0] - 1.1))
     assert np.median(off) < 0.02
+
+
+def test_partners_are_before_and_after_in_the_same_session() -> None:
+    frames = drive(6, right=False)
+    sessions = np.array([0, 0, 0, 0, 1, 1])
+    found = [(now.number, [k.number for k in others]) for now, others in filter(None, with_partners(frames, sessions))]
+    assert found == [(0, [2]), (2, [0, 3]), (4, [5])]
 
 
 def test_depth_only_where_the_camera_moved_or_turned() -> None:

@@ -49,7 +49,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     given: Any = SimpleNamespace(saved=saved)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(colmap, "keyframes", images)
-        patch.setattr(colmap, "shows_more", lambda *_: True)
+        patch.setattr(keyframe_depth, "shows_more", lambda *_: True)
         for module in (colmap, keyframe_depth):
             patch.setattr(module, "VIEW_PX", 320)  # quick
         assert colmap.export_colmap_dense(given, folder) == COUNT

@@ -87,7 +87,7 @@ def test_disparities_are_finer_than_the_matchers_and_know_how_fine() -> None:
     assert known.mean() > 0.8
     matched = np.abs(match_both_ways(noisy[0], noisy[1], 32)[0] - shift)[known]
     assert np.median(error[known]) < 0.8 * np.nanmedian(matched)
-    assert 0.55 < (error <= sigma)[known].mean() < 0.85
+    assert 0.5 < (error <= sigma)[known].mean() < 0.85  # what all windows share is not in it
     again = disparities(noisy[0], noisy[1], 32)
     np.testing.assert_array_equal(again[0], found)
 

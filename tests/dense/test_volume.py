@@ -72,10 +72,12 @@ def test_depths_join_by_their_variances_and_contradictions_are_left_out() -> Non
         full = [np.full(shape, value, np.float32) for value in (r, sigma)]
         return DepthImage(CAMERA, np.eye(3), full[0], full[1], np.zeros(shape, np.uint8))
 
-    both = joined_depth(flat(2.0, 0.02), flat(2.03, 0.01))
+    both = joined_depth([flat(2.0, 0.02), flat(2.03, 0.01)])
     assert 2.015 < np.nanmedian(both.ranges) < 2.03
     assert np.nanmedian(both.sigmas) < 0.01
-    assert not np.isfinite(joined_depth(flat(2.0, 0.02), flat(2.5, 0.02)).ranges).any()
+    assert not np.isfinite(joined_depth([flat(2.0, 0.02), flat(2.5, 0.02)]).ranges).any()
+    outvoted = joined_depth([flat(2.5, 0.02), flat(2.0, 0.02), flat(2.03, 0.01)])
+    np.testing.assert_allclose(outvoted.ranges, both.ranges, rtol=1e-5)
 
 
 def test_ranges_that_are_hardly_known_reach_nowhere() -> None:
