@@ -45,7 +45,8 @@ class Rig(ReadOnly):
     wheel: Wheel | None = None  # calibration of its wheel odometry; None: wheel samples are not used
     left_mask: Bool | None = None  # (H, W) True where the image is used (stereo_sfm.calib.mask); None: everywhere
     right_mask: Bool | None = None  # (H, W)
-    readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: global shutter
+    # Rolling shutter: seconds from the first row's exposure to the last's, negative if read from below; 0: global.
+    readout_s: float = 0.0
 
     def __post_init__(self) -> None:
         for transform in (self.left_T_right, self.body_T_left):
@@ -60,10 +61,10 @@ class Rig(ReadOnly):
                 _check_camera(side, camera)
         _check_mask("left", self.left_mask, self.left)
         _check_mask("right", self.right_mask, self.right)
-        if not 0 <= self.readout_s <= MAX_READOUT_S:
+        if not abs(self.readout_s) <= MAX_READOUT_S:
             raise StereoSfmError(
                 f"invalid calibration: readout of {self.readout_s:g} s; give the seconds from first to last row, "
-                "0 for a global shutter"
+                "negative if rows are read from below, 0 for a global shutter"
             )
         with np.errstate(over="ignore"):
             baseline = self.baseline
@@ -131,7 +132,9 @@ class Rig(ReadOnly):
     @property
     def shutter(self) -> str:
         """The shutter as readable text."""
-        return f"rows read within {1e3 * self.readout_s:g} ms" if self.readout_s else "all rows at once"
+        if not self.readout_s:
+            return "all rows at once"
+        return f"rows read {'from below ' if self.readout_s < 0 else ''}within {1e3 * abs(self.readout_s):g} ms"
 
     def row_seconds(self, rows: F64) -> F64:
         """Seconds from an image's stamp, which is that of the middle row, to the exposure of other rows (pixels)."""

@@ -121,7 +121,7 @@ class SimOptions(SourceOptions):
         0.0, "images a second by their stamps, 0: the rate; wrong as where a folder has no stamps", low=0, high=1000
     )
     readout: float = option(
-        0.0, "rolling shutter: seconds from the exposure of the first row to that of the last", low=0, high=0.1
+        0.0, "rolling shutter: seconds from the exposure of the first row to that of the last", low=-0.1, high=0.1
     )
     dark: tuple[float, float] = option((0.0, 0.0), "FROM-TO in seconds: interval with the lights off", read=_interval)
     imu: Literal["", "ideal", "t265", "oak", "bno086"] = option(

@@ -236,7 +236,7 @@ class SelfCalibration:
         return _Change(value, choice.sigma, covariance, choice.selected) if value.any() else None
 
     def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
-        return choose(whole, parts, self._rig.readout_s > 0, sigmas, self._corrected)
+        return choose(whole, parts, self._rig.readout_s != 0, sigmas, self._corrected)
 
     def _helps(self, halves: Sequence[Sequence[RigWindow]], values: Sequence[F64], basis: F64, back: F64) -> bool:
         """Whether what one half says makes rows and reprojections of the other half's windows better.
@@ -302,7 +302,7 @@ class SelfCalibration:
             return None
         courses = [whole, *(steady(part, windows, self._expected) for part in (windows[::2], windows[1::2]))]
         change, *halves = [c.at([0.0, 1.0]) for c in courses]
-        terms = significant(change, halves, self._rig.readout_s > 0, SIGMAS)
+        terms = significant(change, halves, self._rig.readout_s != 0, SIGMAS)
         return _Drift(terms, [c.with_zero(1, ~terms).at([1.0, 0.0]) for c in courses]) if terms.any() else None
 
 

@@ -132,17 +132,15 @@ def _checked(check: Callable[[], CheckReport], mistake: str) -> CheckReport:
 def _shutter(known: str, readout: Readout) -> Finding:
     from stereo_sfm.calib.check import UNKNOWN, Finding
 
+    below = "from below " if readout.measured_s < 0 else ""
     measured = f"{1e3 * abs(readout.measured_s):.0f} ± {1e3 * readout.sigma_s:.0f} ms"
     if not readout.known:
         return Finding("shutter", 0, f"{known}; {UNKNOWN} unsteadily", judged=False)
     if not readout.differs:
         error = f"points are off by {readout.error_px:.2f} px (median)"
         return Finding("shutter", 0, f"{known}; {error}; measured from the motion: {measured}")
-    if readout.measured_s < 0:
-        upwards = f"{known}, but the motion shows rows read from the last to the first within {measured}"
-        return Finding("shutter", 1, f"{upwards}, which no calibration can say: read the images the other way up")
     what = "check readout_s in rig.yaml" if readout.calibrated_s else "set readout_s in rig.yaml (see the data sheet)"
-    return Finding("shutter", 1, f"{known}, but the motion shows rows read within {measured}: {what}")
+    return Finding("shutter", 1, f"{known}, but the motion shows rows read {below}within {measured}: {what}")
 
 
 def _robot(masks: MaskSearch, rig: Rig) -> list[Finding]:

@@ -71,6 +71,11 @@ def test_a_rolling_shutter_missing_in_the_calibration(vibration: int, seed: int)
     assert found.sigma_s < 0.1 * found.measured_s + 0.0008
 
 
+def test_rows_that_are_read_from_below() -> None:
+    found = search(f"{AISLE}&vibration=4&seed=0&readout=-0.025", 0.025)
+    assert found.differs and found.best_s == pytest.approx(-0.025, abs=0.004)
+
+
 def test_a_global_shutter_and_a_calibrated_one() -> None:
     known = search(f"{AISLE}&vibration=4&seed=0&readout=0.025", 0.025)
     assert known.known and known.best_s == 0.025

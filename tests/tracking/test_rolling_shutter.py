@@ -154,14 +154,15 @@ def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
 
 
 @pytest.mark.parametrize("seeds", [1, pytest.param(3, marks=pytest.mark.slow)])
-def test_a_rendered_sequence_with_a_rolling_shutter(seeds: int) -> None:
+@pytest.mark.parametrize("readout", [0.025, -0.025])
+def test_a_rendered_sequence_with_a_rolling_shutter(readout: float, seeds: int) -> None:
     """A camera with vibration and a readout of 25 ms: much more accurate than without the model."""
     known, unknown = list[float](), list[float]()
     for seed in range(seeds):
-        spec = f"sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025&seed={seed}"
+        spec = f"sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout={readout}&seed={seed}"
         with open_source(spec) as source:
             images, truth = list(source), source.ground_truth
-            assert truth is not None and source.rig.readout_s == 0.025
+            assert truth is not None and source.rig.readout_s == readout
             known.append(ate_mm(source.rig, images, truth))
             unknown.append(ate_mm(dataclasses.replace(source.rig, readout_s=0.0), images, truth))
     print(f"{known} mm, without the times of the rows {unknown} mm")

@@ -36,7 +36,7 @@ class RollingShutter:
         self._right_T_left = se3.inverse(rig.left_T_right)
         self._mean: F64 | None = None  # (6,) velocity between the last two frames
         self._change = np.full(2, FIRST_CHANGE**2)  # variance of its changes along one axis: linear, angular
-        self.active = rig.readout_s > 0
+        self.active = rig.readout_s != 0
 
     def learn(self, mean: F64, seconds: float) -> None:
         """Update the steadiness with the mean velocity (6,) since the last frame, `seconds` before."""
