@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from bisect import bisect
 from collections import deque
@@ -17,7 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase, apart
-from stereo_sfm.loop.graph import KeyframeGraph
+from stereo_sfm.loop.graph import REMEMBERED, KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
@@ -52,7 +53,6 @@ PLACE_RADIUS = (
 KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the corresponding limit of the share of corners of its best keyframe, where several found it
-LOOKALIKES = 3000  # hypotheses between sessions that are remembered: it bounds memory
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
 # Largest difference of two keyframes' estimates of one loop: noise of both, and drift between them.
@@ -112,26 +112,20 @@ class LoopCloser:
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
-        self._alike: deque[_Hypothesis] = deque(maxlen=LOOKALIKES)  # between sessions, since the last loop
-        self._same: dict[tuple[_Hypothesis, _Hypothesis], bool | None] = {}  # of pending ones, see `_same_loop`
+        self._alike: deque[_Hypothesis] = deque(maxlen=REMEMBERED)  # between sessions, since the last loop
+        self._same_loop = functools.lru_cache(REMEMBERED)(self._agree)
         # newest keyframes with corners
         self._described: deque[int] = deque(maxlen=max(GAP_WINDOW, config.consistent_window))
         self._repeated = 0  # keyframes added to views of earlier visits, less those removed there
         self._last_loop = -(10**9)
         self._sees_sides = False  # some keyframe had views that face shelves
 
-    @property
-    def keyframe_count(self) -> int:
-        """Number of keyframes that can be candidates."""
-        return len(self._store)
-
     def step(self, keyframe: Keyframe, own: Rig | None = None) -> LoopResult:
         """Look for a loop with earlier keyframes, then add the keyframe.
 
         Args: own, the rig that took it; None: the closer's.
         """
-        self._know(keyframe, own)
-        bags = self._enter(keyframe)
+        bags = self._enter(keyframe, own)
         unseen = LoopResult.without_loop(keyframe.kf_id, "not_described")
         result = self._search(keyframe, bags) if keyframe.described else unseen
         self._keep(keyframe, bags)
@@ -148,17 +142,12 @@ class LoopCloser:
 
     def add(self, keyframe: Keyframe, own: Rig | None = None) -> None:
         """Add a keyframe of a finished map, to which later ones may close loops. Args: own, as of `step`."""
-        self._know(keyframe, own)
-        self._keep(keyframe, self._enter(keyframe))
+        self._keep(keyframe, self._enter(keyframe, own))
 
     def add_loop(self, loop: LoopResult) -> None:
         """Add a loop between added keyframes that was accepted before."""
         self._graph.add_loop(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
         self._store.merge(loop.matches)
-
-    def _know(self, keyframe: Keyframe, own: Rig | None) -> None:
-        if own is not None and own is not self._rig:
-            self._own[keyframe.kf_id] = own
 
     def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
         sigma, own = self._config.disparity_sigma_px, self._own.get(keyframe.kf_id)
@@ -168,8 +157,10 @@ class LoopCloser:
         own = [self._own.get(k.kf_id, self._rig) for k in (centre, *around)] if self._own else []
         return gather(centre, around, self._rig, self._config.disparity_sigma_px, sideways, own)
 
-    def _enter(self, keyframe: Keyframe) -> tuple[voc.Bag, voc.Bag]:
+    def _enter(self, keyframe: Keyframe, own: Rig | None) -> tuple[voc.Bag, voc.Bag]:
         """Its words and those of its side views; what candidates are judged by knows the keyframe from now on."""
+        if own is not None and own is not self._rig:
+            self._own[keyframe.kf_id] = own
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):  # the tracker's rig was corrected
             self._rig_terms = keyframe.rig_terms
             self._rig = with_terms(self._source_rig, self._rig_terms)
@@ -275,13 +266,10 @@ class LoopCloser:
     def _judge(self, keyframe: Keyframe, candidates: list[Candidate], why_none: str) -> LoopResult:
         verdicts: list[Verdict] = []
         loops: dict[int, _Hypothesis] = {}
-        views: dict[bool, PlaceView] = {}
         for k, candidate in enumerate(candidates):
             if candidate.sideways and any(not loop.against for loop in loops.values()):
                 break
-            if candidate.sideways not in views:
-                views[candidate.sideways] = self._view(keyframe, candidate.sideways)
-            verdicts.append(self._verify(keyframe, views[candidate.sideways], candidate))
+            verdicts.append(self._verify(keyframe, candidate))
             if not verdicts[k].reason:
                 loops[k] = self._hypothesis(keyframe, candidate, verdicts[k])
         if not candidates:
@@ -290,7 +278,6 @@ class LoopCloser:
         reasons = [verdict.reason for verdict in verdicts]
         best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
         self._pending = [h for h in self._pending if h.kf_id in self._described]
-        self._same = {pair: same for pair, same in self._same.items() if all(h.kf_id in self._described for h in pair)}
         self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * best_inliers]
         self._alike.extend(h for h in loops.values() if h.anywhere and not h.sideways)
         accepted = -1
@@ -304,9 +291,9 @@ class LoopCloser:
             return self._accept(keyframe, candidates[accepted], verdicts[accepted], rejected)
         return LoopResult.without_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
 
-    def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: Candidate) -> Verdict:
+    def _verify(self, keyframe: Keyframe, candidate: Candidate) -> Verdict:
         config = self._side_config if candidate.sideways else self._config
-        centre = self._store[candidate.kf_id]
+        view, centre = self._view(keyframe, candidate.sideways), self._store[candidate.kf_id]
         if not candidate.sideways and not looks_alike(view, centre, config):
             return rejection("too_few_matches")
         around = self._around(centre)
@@ -427,13 +414,8 @@ class LoopCloser:
         """What speaks for a loop: by how much the shares of the keyframes that found it exceed those of chance."""
         return sum(max(share - self._chance, 0.0) for share in support.values())
 
-    def _same_loop(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
-        """Whether two loops agree; None if no path connects them."""
-        if (earlier, new) not in self._same:
-            self._same[earlier, new] = self._agree(earlier, new)
-        return self._same[earlier, new]
-
     def _agree(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
+        """Whether two loops agree; None if no path connects them."""
         back = self._graph.path(earlier.candidate_kf_id, new.candidate_kf_id)
         ahead = self._graph.path(new.kf_id, earlier.kf_id)
         if back is None or ahead is None:
@@ -455,7 +437,7 @@ class LoopCloser:
             self._last_loop = keyframe.kf_id
         self._pending.clear()
         self._alike.clear()
-        self._same.clear()
+        self._same_loop.cache_clear()
         return LoopResult(
             kf_id=keyframe.kf_id,
             candidate_kf_id=candidate.kf_id,

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -17,24 +16,19 @@ from stereo_sfm.geometry.hamming import as_words, hamming
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
-from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
+from stereo_sfm.types import F64, I64, Keyframe
 
 # Largest differences of one corner in two keyframes: of positions by stereo, of descriptors (as of points of the map).
 SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50
 
 
 @dataclass(frozen=True, eq=False)
-class Cloud:
-    """M described points in the frame of a centre camera; a physical point may have several rows (views)."""
+class Cloud(PlaceView):
+    """M rows of several views with `points` in the frame of a centre camera; all else is of the row's own keyframe.
 
-    ids: I64  # (M,) point ids; negative for corners that are not map points
-    points: F64  # (M, 3) metres in the centre's camera
-    sigmas: F64  # (M,) metres along the ray of the row's own keyframe
-    descriptors: U8  # (M, 32)
-    uv_left: F64  # (M, 2) px in the image of the row's own keyframe
-    uv_right: F64  # (M, 2)
-    corner: Bool  # (M,) of `Keyframe.corners` or `Keyframe.sides`; False: a point
-    rows: I64  # (M,) of a corner: its row there
+    A physical point may have several rows, with the same id; that of a corner which is no map point is negative.
+    """
+
     view: I64  # (M,) the row's own keyframe: row of centre_T_kf
     centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
 
@@ -65,20 +59,13 @@ def gather(
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
     rigs = own or [rig] * len(keyframes)
     views = [place_view_of(k, rig, disparity_sigma, sideways, o) for k, o in zip(keyframes, rigs, strict=True)]
-    points = np.concatenate([view.points for view in views])
-    deep = np.flatnonzero(np.isfinite(points[:, 2]))
-
-    def joined(name: str) -> Any:
-        return np.concatenate([getattr(view, name) for view in views]).take(deep, axis=0)
-
+    columns = {f.name: np.concatenate([getattr(view, f.name) for view in views]) for f in fields(PlaceView)}
+    deep = np.flatnonzero(np.isfinite(columns["points"][:, 2]))
     view = np.repeat(np.arange(len(views)), [len(view.ids) for view in views]).take(deep)
-    points, ends = points.take(deep, axis=0), np.searchsorted(view, np.arange(len(views) + 1))
+    cloud = Cloud(**{name: c.take(deep, axis=0) for name, c in columns.items()}, view=view, centre_T_kf=centre_T_kf)
+    ends = np.searchsorted(view, np.arange(len(views) + 1))
     for t, first, end in zip(centre_T_kf, ends[:-1], ends[1:], strict=True):
-        points[first:end] = se3.transform(t, points[first:end])
-    cloud = Cloud(
-        joined("ids"), points, joined("sigmas"), joined("descriptors"), joined("uv_left"), joined("uv_right"),
-        joined("corner"), joined("rows"), view, centre_T_kf,
-    )  # fmt: skip
+        cloud.points[first:end] = se3.transform(t, cloud.points[first:end])
     cloud.ids[cloud.corner] = _name_corners(views, cloud, rig)
     return cloud
 

@@ -51,11 +51,6 @@ class PlaceDatabase:
         self._words.keyframe[:] = keyframe[keyframe >= 0]
         self.kf_ids = self.kf_ids[rows]
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays."""
-        return self._words.nbytes + self._asked.nbytes + self.kf_ids.nbytes
-
     def scores(self, bag: Bag) -> F64:
         """(K,) L1 score in [0, 1] of every keyframe in order of insertion: 1 - |a - b|_1 / 2, the common minima."""
         scores = np.zeros(len(self))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Container
 from dataclasses import dataclass
 
@@ -21,7 +22,7 @@ GAP_SHARE = (
 )
 MIN_SPEED = 0.5  # metres a second, lower bound of that speed
 SPEED_NS = 1_000_000_000  # before a gap, over which it is measured: what covers a camera disturbs its last few poses
-KNOWN_PATHS = 4096  # that are remembered, a few megabytes
+REMEMBERED = 4096  # results of each kind since the last loop: a few megabytes
 FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
 NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two submaps half
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there: a second has fewer
@@ -73,7 +74,7 @@ class KeyframeGraph:
         self._nodes, self._loops = _Nodes(), _Loops()
         self._joined: dict[int, int] = {}  # submap -> number of the group of submaps that loops connect
         self._forget_at = FIRST_FORGOTTEN
-        self._known: dict[tuple[int, int], GraphPath | None] = {}  # paths since the last loop, by ids of their ends
+        self.path = functools.lru_cache(REMEMBERED)(self._find_path)
 
     def _row(self, kf_id: int) -> int:
         return int(np.searchsorted(self._nodes.kf_id, kf_id))
@@ -120,7 +121,7 @@ class KeyframeGraph:
         loops.keep(np.flatnonzero(needed))
         loops.ends[:] = np.searchsorted(rows, loops.ends)
         nodes.keep(rows)
-        self._known.clear()
+        self.path.cache_clear()
         self._forget_at = 2 * len(rows) + FIRST_FORGOTTEN
         return rows
 
@@ -161,7 +162,7 @@ class KeyframeGraph:
 
     def add_loop(self, a: int, b: int, a_T_b: F64) -> None:
         """Link two keyframes whose relative pose was verified."""
-        self._known.clear()
+        self.path.cache_clear()
         nodes, row_a, row_b = self._nodes, self._row(a), self._row(b)
         self._loops.append(1, ends=(row_a, row_b), a_T_b=a_T_b)
         nodes.anchored[row_b], nodes.frame[row_b] = nodes.anchored[row_a] @ a_T_b, nodes.frame[row_a]
@@ -213,15 +214,8 @@ class KeyframeGraph:
         step = se3.inverse(nodes.odom_T_cam[row]) @ nodes.odom_T_cam[before]
         return -step[:3, 3] / (1e-9 * float(nodes.stamp_ns[row] - nodes.stamp_ns[before]))
 
-    def path(self, a: int, b: int) -> GraphPath | None:
-        """The shortest path (Dijkstra), None if neither odometry nor loops connect the keyframes."""
-        if (a, b) not in self._known:
-            if len(self._known) >= KNOWN_PATHS:
-                self._known.clear()
-            self._known[a, b] = self._find_path(a, b)
-        return self._known[a, b]
-
     def _find_path(self, a: int, b: int) -> GraphPath | None:
+        """The shortest path (Dijkstra), None if neither odometry nor loops connect the keyframes."""
         nodes, loops = self._nodes, self._loops.ends
         rows = np.unique(np.append(loops.ravel(), (self._row(a), self._row(b))))
         linked = np.flatnonzero(nodes.submap[rows[:-1]] == nodes.submap[rows[1:]])

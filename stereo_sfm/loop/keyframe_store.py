@@ -44,16 +44,6 @@ class KeyframeStore:
     def __len__(self) -> int:
         return len(self.ids)
 
-    @property
-    def sightings(self) -> int:
-        """Points of all keyframes."""
-        return len(self._sightings)
-
-    @property
-    def known_points(self) -> int:
-        """Ids of points that the kept keyframes see, and of not many others."""
-        return len(self._points)
-
     def _know(self, point_ids: I64) -> I64:
         """(N,) number of each point; unknown ones are added."""
         new = np.unique(point_ids[self._points.find(point_ids) < 0])

@@ -56,12 +56,6 @@ def _bits(rig: Rig) -> Any:
     return *lenses, rig.depth, rig.left_T_right.tobytes()
 
 
-def _cameras(a: Rig, b: Rig) -> list[tuple[str, Camera | None, Camera | None]]:
-    """(side, camera of a, camera of b) of the sides that one of them has."""
-    sides = (("left", a.left, b.left), ("right", a.right, b.right))
-    return [(side, x, y) for side, x, y in sides if x is not None or y is not None]
-
-
 def difference(a: Rig, b: Rig, corrected: bool = False) -> str:
     """What b has that a has not, in words; "" if nothing.
 
@@ -69,7 +63,7 @@ def difference(a: Rig, b: Rig, corrected: bool = False) -> str:
     """
     out = [f"serial number {b.serial} instead of {a.serial}"] if a.serial and b.serial and a.serial != b.serial else []
     out += [f"{_kind(b)} instead of {_kind(a)}"] if _kind(a) != _kind(b) else []
-    for side, x, y in _cameras(a, b):
+    for side, x, y in (("left", a.left, b.left), ("right", a.right, b.right)):
         if x is not None and y is not None:
             out += _lens_difference(side, x, y, corrected and side == "right")
     if a.stereo and b.stereo:
@@ -138,14 +132,11 @@ def read_cameras(path: Path) -> dict[int, MapCamera]:
     """
     found: dict[int, MapCamera] = {}
     with reading(path, "cameras"):
-        for entry in _entries(read_yaml(path)):
+        data = read_yaml(path)
+        if data.get(KEY) != 1:
+            raise ValueError(f"{KEY} is {data.get(KEY)}, this version of the program reads 1")
+        for entry in data["cameras"]:
             rig = rig_from_plain(entry["calibration"])
             for session, correction in entry["corrections"].items():
                 found[int(session)] = MapCamera(rig, np.array(numbers(str(correction).split(), RIG_TERMS)))
     return found
-
-
-def _entries(data: dict[str, Any]) -> list[Any]:
-    if data.get(KEY) != 1:
-        raise ValueError(f"{KEY} is {data.get(KEY)}, this version of the program reads 1")
-    return data["cameras"]

@@ -123,7 +123,8 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
             instead (next to `map_out` where that is the map to merge with).
         OSError: the map cannot be written.
     """
-    from stereo_sfm.maps.saved_map import save_map
+    from stereo_sfm.maps.merge import merge
+    from stereo_sfm.maps.saved_map import load_map, save_map
     from stereo_sfm.maps.store import lock_versioned
 
     kept = folders.kept if folders.map_in is None or folders.map_out is not None else None
@@ -138,7 +139,8 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
         if folders.map_in is not None and out is not None:
             try:
                 held.enter_context(lock_versioned(out))
-                saved = _merged(mapper, saved, folders.map_in, config)
+                both, vocabulary = [load_map(folders.map_in), saved], configured_vocabulary(config.loop)
+                saved = merge(both, vocabulary, config.loop, config.mapper, mapper.place()).saved
             except StereoSfmError as error:
                 out = _unused_name(out) if out.resolve() == folders.map_in.resolve() else out
                 failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
@@ -146,15 +148,6 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
             save_map(saved, folder)
     if failure:
         raise StereoSfmError(failure)
-
-
-def _merged(mapper: AnyMapper, session: SavedMap, map_in: Path, config: Config) -> SavedMap:
-    from stereo_sfm.maps.merge import merge
-    from stereo_sfm.maps.saved_map import load_map
-
-    before = load_map(map_in)
-    vocabulary = configured_vocabulary(config.loop)
-    return merge([before, session], vocabulary, config.loop, config.mapper, mapper.place()).saved
 
 
 def _unused_name(folder: Path) -> Path:

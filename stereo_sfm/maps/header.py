@@ -10,9 +10,8 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_text
 
-# Versions of files: 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
-SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE = 3, 4, 5
-VERSION = CAMERAS_SINCE
+# Of the files: 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions.
+OLDEST, VERSION = 2, 5
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 
@@ -51,7 +50,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
         version = head["version"] if head["kind"] == KIND else None
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None
-    if version not in (2, SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE):
+    if version not in range(OLDEST, VERSION + 1):
         raise StereoSfmError(
             f"the map {folder} is version {version}, this program reads version {VERSION}: make the map again, or "
             "use the stereo-sfm that wrote it"

@@ -10,7 +10,7 @@ import numpy as np
 
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.loop.closer import LoopCloser
-from stereo_sfm.loop.other_camera import widest
+from stereo_sfm.loop.place_view import widest
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import bundle_adjust

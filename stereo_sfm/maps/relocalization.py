@@ -16,8 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase, apart
-from stereo_sfm.loop.other_camera import widest
-from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of
+from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of, widest
 from stereo_sfm.loop.sideways import (
     MIN_CORNERS,
     SIDE_FACTOR,
@@ -102,7 +101,7 @@ class Relocalizer:
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
-        self._sees = self._seen.tocsc()
+        self._sees = self._seen.T.tocsr()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)  # cameras ask from near where they were
         self._vocabularies: list[Vocabulary] = []  # ahead and beside, with the idf of this map
@@ -279,7 +278,7 @@ class Relocalizer:
 
     def _gather(self, row: int, sideways: bool) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
-        shared = self._shared(row)
+        shared = (self._seen[[row]] @ self._sees).toarray()[0]  # points that each keyframe shares with this one
         shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
         order = np.argsort(-shared, kind="stable")[:PLACE_KEYFRAMES]
@@ -293,19 +292,9 @@ class Relocalizer:
         sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA_M)
         return dataclasses.replace(cloud, sigmas=sigmas)
 
-    def _shared(self, row: int) -> I64:
-        """(K,) points that each keyframe shares with that of a row."""
-        seen, sees = self._seen, self._sees
-        points = seen.indices[seen.indptr[row] : seen.indptr[row + 1]]
-        first, count = sees.indptr[points], sees.indptr[points + 1] - sees.indptr[points]
-        at = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
-        return np.bincount(sees.indices[at], minlength=len(self._keyframes))
-
     def _places(self, scores: F64) -> list[int]:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
-        together = np.zeros(len(scores))
-        together[self._described] = with_neighbours(scores[self._described])
-        best = np.argsort(-together, kind="stable")
+        best = np.argsort(-with_neighbours(scores), kind="stable")
         scored = best[np.logical_and.accumulate(scores[best] > 0)]
         return apart(scored.tolist(), 2, PLACES)
 

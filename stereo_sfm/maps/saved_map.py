@@ -23,16 +23,7 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.cameras import MapCamera, cameras_text, difference, read_cameras, unified
 from stereo_sfm.maps.columns import COLUMNS, KEYS, check_columns
-from stereo_sfm.maps.header import (
-    CAMERAS_SINCE,
-    DOWN_SINCE,
-    SIDES_SINCE,
-    check_counts,
-    checksum,
-    damaged,
-    read_header,
-    write_header,
-)
+from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import F64, I64, RIG_TERMS, MapUpdate, Trajectory
 
@@ -40,6 +31,7 @@ log = logging.getLogger("stereo_sfm")
 
 RIG, CAMERAS = "rig.yaml", "cameras.yaml"
 _FILES = {table: [n for n, c in COLUMNS.items() if c.table == table] for table in KEYS}
+_LATER = "corner_side", "down", "down_sigma"  # columns that files of older versions lack: zeros
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +141,6 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     """
     folder = Path(folder).expanduser()
     head = read_header(folder, (*_FILES, "rig"))
-    sessions_with_cameras = head["version"] >= CAMERAS_SINCE
     checksums = head["sha256"]
     columns: dict[str, Any] = {}
     try:
@@ -158,16 +149,14 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
             if checksum(raw) != checksums[name]:
                 raise ValueError(name)
             data = read_arrays(raw)
-            if name == "corners" and head["version"] < SIDES_SINCE:
-                data["corner_side"] = np.zeros(len(data["corner_kf"]), bool)
-            if name == "keyframes" and head["version"] < DOWN_SINCE:
-                data["down"], data["down_sigma"] = np.zeros((len(data["kf_ids"]), 3)), np.zeros(len(data["kf_ids"]))
+            for c in set(_LATER).intersection(wanted).difference(data):
+                data[c] = np.zeros((len(data[KEYS[name]]), *COLUMNS[c].shape), COLUMNS[c].dtype)
             columns.update({c: data[c] for c in wanted})
-        for name, file in (("rig", RIG), ("cameras", CAMERAS))[: 1 + sessions_with_cameras]:
-            if checksum(read_bytes(folder / file)) != checksums[name]:
+        for name, file in (("rig", RIG), ("cameras", CAMERAS)):
+            if name in checksums and checksum(read_bytes(folder / file)) != checksums[name]:
                 raise ValueError(name)
         own = MapCamera(read_native(folder / RIG))
-        cameras = read_cameras(folder / CAMERAS) if sessions_with_cameras else {}
+        cameras = read_cameras(folder / CAMERAS) if "cameras" in checksums else {}
     except (OSError, KeyError, ValueError, StereoSfmError):
         raise damaged(folder, "a file is missing or was changed") from None
     try:
@@ -181,7 +170,7 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     if not len(snapshot.kf_ids) or not len(snapshot.points):
         raise StereoSfmError(f"the map {folder} is empty: it has no keyframes or no points")
     saved = SavedMap(snapshot, cameras, head["vocabulary"], sessions)
-    if not sessions_with_cameras:
+    if not cameras:
         cameras.update(dict.fromkeys(saved.session_ids, own))
     if not cameras.keys() >= set(saved.session_ids):
         raise damaged(folder, f"{CAMERAS} lacks a session")

@@ -152,22 +152,17 @@ def write_version(
         The number of the version.
     """
     with lock_about(store):
-        return _write_version(store, saved, changes, keep, compress)
-
-
-def _write_version(store: Path, saved: SavedMap, changes: list[str], keep: int, compress: bool) -> int:
-    exists = (store / "map.json").exists()
-    about = read_about(store) if exists else About(0, find_floor(saved.snapshot))
-    if exists:
-        copy_map(store, versions_folder(store) / f"{about.version:05d}")
-        about = dataclasses.replace(about, version=about.version + 1)
-    beside = _extras(store)
-    beside[ABOUT] = _about_text(about)
-    beside[CHANGES] = "".join(f"{line}\n" for line in changes).encode()
-    save_map(saved, store, beside, compress)
-    for number in versions(store)[: -keep or None]:
-        shutil.rmtree(versions_folder(store) / f"{number:05d}")
-    return about.version
+        if (store / "map.json").exists():
+            about = read_about(store)
+            copy_map(store, versions_folder(store) / f"{about.version:05d}")
+            about = dataclasses.replace(about, version=about.version + 1)
+        else:
+            about = About(0, find_floor(saved.snapshot))
+        lines = "".join(f"{line}\n" for line in changes)
+        save_map(saved, store, _extras(store) | {ABOUT: _about_text(about), CHANGES: lines.encode()}, compress)
+        for number in versions(store)[: -keep or None]:
+            shutil.rmtree(versions_folder(store) / f"{number:05d}")
+        return about.version
 
 
 def _extras(store: Path) -> dict[str, bytes]:
@@ -197,9 +192,8 @@ def undo(store: Path) -> int:
     if not kept:
         raise StereoSfmError(f"no earlier version of {store} is kept")
     folder = versions_folder(store) / f"{kept[-1]:05d}"
-    beside = _extras(store)
-    beside[ABOUT] = _about_text(dataclasses.replace(read_about(store), version=kept[-1]))
-    beside[CHANGES] = read_bytes(folder / CHANGES) if (folder / CHANGES).is_file() else b""
-    save_map(load_map(folder), store, beside)
+    about = dataclasses.replace(read_about(store), version=kept[-1])
+    changes = read_bytes(folder / CHANGES) if (folder / CHANGES).is_file() else b""
+    save_map(load_map(folder), store, _extras(store) | {ABOUT: _about_text(about), CHANGES: changes})
     shutil.rmtree(folder)
     return kept[-1]

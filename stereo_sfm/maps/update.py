@@ -95,8 +95,16 @@ def without_superseded(together: MapSnapshot, sessions: I64) -> tuple[MapSnapsho
 
 
 def in_frame_of(before: MapSnapshot, after: MapSnapshot) -> MapSnapshot:
-    """A map that goes on from another one: in its frame, with ids from 0 on."""
-    return _renumbered(_moved(after, _back(before, after)))
+    """A map that goes on from another one: in its frame; ids from 0 on do not grow with the number of sessions."""
+    move = _back(before, after)
+    return dataclasses.replace(
+        after,
+        map_T_kf=se3.orthonormalize(move @ after.map_T_kf),
+        points=se3.transform(move, after.points),
+        kf_ids=np.arange(len(after.kf_ids), dtype=np.int64),
+        pt_ids=np.arange(len(after.pt_ids), dtype=np.int64),
+        submap_ids=np.unique(after.submap_ids, return_inverse=True)[1].astype(np.int64),
+    )
 
 
 def _superseded(s: MapSnapshot, sessions: I64) -> Bool:
@@ -128,19 +136,3 @@ def _back(before: MapSnapshot, after: MapSnapshot) -> F64:
     rotation = u @ vt
     shift = (before.map_T_kf[i, :3, 3] - after.map_T_kf[j, :3, 3] @ rotation.T).mean(0)
     return se3.from_rotation_translation(rotation, shift)
-
-
-def _moved(s: MapSnapshot, new_T_old: F64) -> MapSnapshot:
-    poses = se3.orthonormalize(new_T_old @ s.map_T_kf)
-    return dataclasses.replace(s, map_T_kf=poses, points=se3.transform(new_T_old, s.points))
-
-
-def _renumbered(s: MapSnapshot) -> MapSnapshot:
-    """Ids from 0 on: tables by id do not grow with the number of sessions."""
-    submaps = np.unique(s.submap_ids, return_inverse=True)[1].astype(np.int64)
-    return dataclasses.replace(
-        s,
-        kf_ids=np.arange(len(s.kf_ids), dtype=np.int64),
-        pt_ids=np.arange(len(s.pt_ids), dtype=np.int64),
-        submap_ids=submaps,
-    )

@@ -12,7 +12,6 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.closer import GAP_WINDOW, Candidate, LoopCloser
-from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
 from stereo_sfm.mapping.culling import PASSED
 from stereo_sfm.types import F64, Corners, Keyframe, LoopResult
@@ -86,7 +85,7 @@ def test_of_two_similar_places_the_one_with_more_inliers_is_accepted(vocabulary:
 def scripted(sequence: StoreSequence, answers: dict[tuple[int, int], tuple[int, F64]]) -> Callable[..., Verdict]:
     """In place of `LoopCloser._verify`: (keyframe, candidate) -> inliers, and the error of the relative pose."""
 
-    def answer(_: LoopCloser, keyframe: Keyframe, __: PlaceView, of: Candidate) -> Verdict:
+    def answer(_: LoopCloser, keyframe: Keyframe, of: Candidate) -> Verdict:
         candidate = of.kf_id
         if (keyframe.kf_id, candidate) not in answers:
             return rejection("too_few_matches")
@@ -229,12 +228,12 @@ def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found
     results, keyframe_count = list[LoopResult](), list[int]()
     for keyframe in sequence.keyframes:
         results.append(closer.step(keyframe))
-        keyframe_count.append(closer.keyframe_count)
+        keyframe_count.append(len(closer._store))
     lap = len(sequence.keyframes) // 7
     described = sum(keyframe.described for keyframe in sequence.keyframes[: lap + 1])
     assert keyframe_count[lap] == described  # nothing is forgotten on the first lap
     assert keyframe_count[-1] - keyframe_count[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
-    assert len(closer._database) <= 2 * closer.keyframe_count + PASSED + 1  # what is forgotten takes no room
+    assert len(closer._database) <= 2 * len(closer._store) + PASSED + 1  # what is forgotten takes no room
     check_forgotten(closer, results)
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
@@ -249,7 +248,7 @@ def test_of_many_views_seen_every_lap_a_limited_number_is_kept_besides_the_first
     results, keyframe_count = list[LoopResult](), list[int]()
     for keyframe in sequence.keyframes:
         results.append(closer.step(keyframe))
-        keyframe_count.append(closer.keyframe_count)
+        keyframe_count.append(len(closer._store))
     lap = len(sequence.keyframes) // 7
     assert keyframe_count[lap] == sum(keyframe.described for keyframe in sequence.keyframes[: lap + 1])
     assert keyframe_count[-1] < 1.2 * keyframe_count[lap] + 5 + PASSED  # three times as many without

@@ -16,7 +16,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.other_camera import seen_by, widest
+from stereo_sfm.loop.place_view import seen_by, widest
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.maps.cameras import MapCamera, difference, unified
 from stereo_sfm.maps.merge import merge

@@ -307,12 +307,6 @@ def test_a_session_continues_in_the_frame_of_the_saved_map(
     assert np.linalg.norm((se3.inverse(poses.all()[9]) @ last @ keyframes[9].odom_T_cam)[:3, 3]) < 0.05
 
 
-def test_keyframes_that_share_points_are_counted_as_in_the_whole_table(relocalizer: Relocalizer) -> None:
-    table = relocalizer._seen.toarray()
-    for row in (0, 7, len(table) - 1):
-        assert np.array_equal(relocalizer._shared(row), table @ table[row])
-
-
 def test_answers_do_not_depend_on_clouds_of_earlier_questions(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
