@@ -14,13 +14,17 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.chi_squared import chi_squared
-from stereo_sfm.loop import p3p, pose_kernels
-from stereo_sfm.loop.p3p import Lens
-from stereo_sfm.types import F64, I64, Bool
+from stereo_sfm.loop import pose_kernels
+from stereo_sfm.loop.pose_kernels import Lens
+from stereo_sfm.loop.pose_kernels import add_normal_equations as add
+from stereo_sfm.types import F64, Bool
 
 CHI2_2DOF_95 = chi_squared(0.95, 2)  # sigmas^2, of a pixel beyond which a match disagrees
+# Threes of matches: at a share of 0.2 that are right, four threes are right. Of them those with the likeliest ranges,
+# whose poses are compared by all matches: the ranges of wrong ones differ from the measured ones.
+SAMPLES, SCORED = 500, 50
+STEPS = 3  # of Newton's method: an error of a tenth becomes one of a millionth
 DAMPING = 1e-9 * np.eye(6)  # m^-2, rad^-2: a direction of which nothing is known stays
 
 
@@ -54,34 +58,50 @@ class Pose:
     b_T_a: F64  # (4, 4)
     information: F64  # (6, 6) of exp(xi) @ b_T_a, equal to that of inverse(b_T_a) @ exp(xi)
     inlier: Bool  # (N,) consistent in every direction that could be checked
-    rms: float  # normalised error of the inliers (1: the noise is as assumed)
 
 
-def ransac_pose(
-    matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float, iterations: int = 400
-) -> F64 | None:
-    """b_T_a (4, 4) with the smallest truncated error, or None if no sample of three gives a pose."""
+def ransac_pose(matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float) -> F64 | None:
+    """b_T_a (4, 4) with the smallest truncated error among the poses of many threes, None if no three give a pose."""
     if matches.size < 4:
         return None
-    bearings = rig.left.unproject(matches.uv_left_b)
-    usable = np.flatnonzero(np.isfinite(bearings[:, 0]))
-    if len(usable) < 4:
+    rows = rng.integers(0, matches.size, (SAMPLES, 3))
+    points, rays = matches.points_a[rows], rig.left.unproject(matches.uv_left_b)[rows]
+    measured = np.linalg.norm(matches.points_b, axis=1)[rows]
+    known = np.isfinite(measured)
+    variance = matches.sigmas_a[rows] ** 2 + matches.sigmas_b[rows] ** 2
+    with np.errstate(all="ignore"):  # three that give no pose become NaN
+        ranges = _ranges(points, rays, np.where(known, measured, np.linalg.norm(points, axis=2)))
+        off = np.where(known, (ranges - measured) ** 2 / variance, 0.0).sum(1)
+        best = np.argsort(off, kind="stable")[:SCORED]
+        poses = _frames(rays[best] * ranges[best, :, None]) @ se3.inverse(_frames(points[best]))
+    poses = poses[np.isfinite(poses).all((1, 2))]
+    if not len(poses):
         return None
-    samples = usable[_distinct_triples(rng, len(usable), iterations)]
     lens = Lens(rig.left.model_id, rig.left.params, pixel_sigma)
-    best, cost = p3p.ransac(matches, bearings, lens, CHI2_2DOF_95, samples, 0.9999)
-    return se3.orthonormalize(np.vstack([best, [0, 0, 0, 1]])) if np.isfinite(cost) else None
+    return se3.orthonormalize(poses[pose_kernels.cheapest(poses, se3.inverse(poses), matches, lens, CHI2_2DOF_95)])
 
 
-def _distinct_triples(rng: np.random.Generator, n: int, count: int) -> I64:
-    """(count, 3) rows below n, distinct within a triple."""
-    a = rng.integers(0, n, count)
-    b = (a + rng.integers(1, n, count)) % n
-    c = rng.integers(0, n - 2, count)
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    c = c + (c >= low)
-    c = c + (c >= high)
-    return np.stack([a, b, c], axis=1)
+def _ranges(points: F64, rays: F64, ranges: F64) -> F64:
+    """(S, 3) metres along rays (S, 3, 3) to where they are as far apart as points (S, 3, 3), nearest to `ranges`."""
+    p, q, pairs = np.array([0, 0, 1]), np.array([1, 2, 2]), np.arange(3)
+    cosines, squares = (rays[:, p] * rays[:, q]).sum(-1), np.square(points[:, p] - points[:, q]).sum(-1)
+    columns = np.zeros((len(rays), 3, 3))  # of the Jacobian: by range, by pair
+    for _ in range(STEPS):
+        a, b = ranges[:, p], ranges[:, q]
+        columns[:, p, pairs], columns[:, q, pairs] = 2 * (a - cosines * b), 2 * (b - cosines * a)
+        adjugate = np.cross(np.roll(columns, -1, axis=1), np.roll(columns, 1, axis=1))
+        determinant = (columns[:, :1] * adjugate[:, :1]).sum(-1)
+        error = a * a + b * b - 2 * cosines * a * b - squares
+        ranges = ranges - (adjugate @ error[..., None])[..., 0] / determinant
+    return ranges
+
+
+def _frames(corners: F64) -> F64:
+    """(S, 4, 4) frames of triangles (S, 3, 3): from their middles, x along the first side; NaN without an area."""
+    side, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(side, other)
+    axes = np.stack([side, np.cross(normal, side), normal], axis=2)
+    return se3.from_rotation_translation(axes / np.linalg.norm(axes, axis=1, keepdims=True), corners.mean(1))
 
 
 def consistent(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float) -> Bool:
@@ -92,36 +112,26 @@ def consistent(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float) -> Bo
 
 def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iterations: int = 10) -> Pose:
     """Gauss-Newton on exp(xi) @ b_T_a over both images and both directions, with the inliers of every iteration."""
-    t = b_T_a
-    inlier = consistent(t, matches, rig, pixel_sigma)
-    hessian, rms = np.zeros((6, 6)), float("inf")
-    right_T_left = None if rig.right is None else se3.inverse(rig.left_T_right)
+    t, m = b_T_a, matches
+    images = [(rig.left, np.eye(4), m.uv_left_b, m.uv_left_a)]
+    if rig.right is not None:
+        images.append((rig.right, se3.inverse(rig.left_T_right), m.uv_right_b, m.uv_right_a))
+    inlier = consistent(t, m, rig, pixel_sigma)
+    hessian = np.zeros((6, 6))
     for _ in range(iterations):
-        hessian, gradient, rms = _normal_equations(t, matches, rig, right_T_left, pixel_sigma, inlier)
+        hessian, gradient, back = np.zeros((6, 6)), np.zeros(6), se3.inverse(t)
+        for camera, camera_T_left, uv_b, uv_a in images:
+            lens = Lens(camera.model_id, camera.params, pixel_sigma)
+            ahead, behind = camera_T_left @ t, camera_T_left @ back
+            add(t, ahead, camera_T_left, m.points_a, m.sigmas_a, uv_b, inlier, lens, hessian, gradient)
+            add(np.eye(4), behind, -behind, m.points_b, m.sigmas_b, uv_a, inlier, lens, hessian, gradient)
         try:
             step: F64 = -np.asarray(np.linalg.solve(hessian + DAMPING, gradient), np.float64)
         except np.linalg.LinAlgError:
             break
         t = se3.exp(step) @ t
-        updated = consistent(t, matches, rig, pixel_sigma)
+        updated = consistent(t, m, rig, pixel_sigma)
         if np.abs(step).max() < 1e-6 and np.array_equal(updated, inlier):
             break
         inlier = updated
-    return Pose(se3.orthonormalize(t), hessian, inlier, rms)
-
-
-def _normal_equations(
-    t: F64, m: Matches, rig: Rig, right_T_left: F64 | None, pixel_sigma: float, inlier: Bool
-) -> tuple[F64, F64, float]:
-    hessian, gradient, sums = np.zeros((6, 6)), np.zeros(6), np.zeros(2)
-    back = se3.inverse(t)
-
-    def add(camera: Camera, camera_T_left: F64, ahead: F64, behind: F64, uv_b: F64, uv_a: F64) -> None:
-        seen, lens = m._replace(uv_left_b=uv_b, uv_left_a=uv_a), Lens(camera.model_id, camera.params, pixel_sigma)
-        poses = t, camera_T_left, ahead, behind
-        pose_kernels.add_normal_equations(*poses, seen, inlier, lens, (hessian, gradient, sums))
-
-    add(rig.left, np.eye(4), t, back, m.uv_left_b, m.uv_left_a)
-    if rig.right is not None and right_T_left is not None:
-        add(rig.right, right_T_left, right_T_left @ t, right_T_left @ back, m.uv_right_b, m.uv_right_a)
-    return hessian, gradient, float(np.sqrt(sums[0] / max(2 * sums[1], 1)))
+    return Pose(se3.orthonormalize(t), hessian, inlier)

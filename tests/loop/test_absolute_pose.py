@@ -1,4 +1,4 @@
-"""Three-point pose, its RANSAC, and the refinement over both cameras and both directions."""
+"""The RANSAC of a relative pose, and the refinement over both cameras and both directions."""
 
 from __future__ import annotations
 
@@ -8,25 +8,8 @@ import pytest
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import absolute_pose as ap
-from stereo_sfm.loop import p3p
 from stereo_sfm.types import F64
 from tests.synthetic import fisheye_rig, pinhole_rig, see
-
-
-def test_p3p_contains_the_true_pose() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(500):
-        b_T_a = se3.exp(rng.normal(size=6) * [1, 1, 1, 0.7, 0.7, 0.7])
-        points_b = rng.normal(size=(3, 3)) * 2
-        bearings = points_b / np.linalg.norm(points_b, axis=1, keepdims=True)
-        points_a = np.ascontiguousarray(se3.transform(se3.inverse(b_T_a), points_b))
-        solutions, count = p3p.p3p(points_a, bearings)
-        assert min(np.abs(solutions[k] - b_T_a[:3]).max() for k in range(count)) < 1e-5
-
-
-def test_p3p_refuses_degenerate_points() -> None:
-    line = np.array([[0, 0, 1.0], [0, 0, 2.0], [0, 0, 3.0]])
-    assert p3p.p3p(line, np.eye(3))[1] == 0
 
 
 def scene(rig: Rig, count: int, outliers: float, rng: np.random.Generator) -> tuple[F64, ap.Matches, np.ndarray]:
@@ -62,6 +45,19 @@ def test_pose_among_sixty_percent_outliers(rig: Rig) -> None:
         errors.append(se3.log(pose.b_T_a @ se3.inverse(b_T_a)))
     assert np.sqrt((np.array(errors)[:, :3] ** 2).sum(1).mean()) < (0.01 if rig.left.model == "pinhole" else 0.03)
     assert np.rad2deg(np.abs(np.array(errors)[:, 3:])).max() < 0.7
+
+
+def test_pose_of_a_camera_without_depth() -> None:
+    rig, rng = fisheye_rig(), np.random.default_rng(4)
+    b_T_a, matches, _ = scene(rig, 200, 0.5, rng)
+    start = ap.ransac_pose(matches._replace(points_b=np.full_like(matches.points_b, np.nan)), rig, rng, 1.0)
+    assert start is not None and np.linalg.norm((start @ se3.inverse(b_T_a))[:3, 3]) < 0.1
+
+
+def test_no_pose_from_equal_points() -> None:
+    rig = fisheye_rig()
+    _, matches, _ = scene(rig, 1, 0.0, np.random.default_rng(0))
+    assert ap.ransac_pose(ap.joined([matches] * 8), rig, np.random.default_rng(0), 1.0) is None
 
 
 def test_information_predicts_the_scatter() -> None:
