@@ -50,7 +50,6 @@ CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate
 PLACE_RADIUS = (
     3  # keyframes: candidates at most so many keyframes apart are one place: only the best of them is verified
 )
-KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the corresponding limit of the share of corners of its best keyframe, where several found it
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
@@ -191,7 +190,7 @@ class LoopCloser:
         if settled not in self._store:
             return [settled] if settled >= 0 else []
         before = self._store.ids[: bisect(self._store.ids, settled)]
-        known = [k for k in self._graph.same_view(settled, KNOWN_VIEWS) if k <= settled]
+        known = [k for k in self._graph.same_view(settled, 2) if k <= settled]  # one is as good as the other
         came_back = known[0] < max(set(before).difference(known), default=-1)
         same_view = [k for k in self._graph.same_view(settled) if k <= settled]
         gone = same_view[1] if len(same_view) > OF_A_VIEW else -1
@@ -346,7 +345,7 @@ class LoopCloser:
         else:
             gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
             anywhere = gap is None
-            off = math.nan if gap is None else gap.deviation - DRIFT[0] * gap.distance
+            off = math.nan if gap is None else gap.deviation - DRIFT[0] * gap.distance - config.gate_m
             if of.sideways:
                 enough = verdict.inliers >= SIDE_FACTOR * config.side_inliers
             else:

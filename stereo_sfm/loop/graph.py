@@ -12,19 +12,17 @@ from scipy.sparse.csgraph import dijkstra
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.columns import Columns, column
+from stereo_sfm.mapping.culling import SAME_VIEW_DEG, SAME_VIEW_DEPTHS
 from stereo_sfm.types import F64, I64, Bool
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views, of shelves a few metres away
-SAME_METRES, SAME_RADIANS = 0.3, 0.25  # between keyframes of the same view: about `culling`'s at a depth of two metres
-GAP_METRES = 0.3  # metres, constant part of the tolerance after a gap in tracking: that of `LoopConfig.gate_m`
 GAP_SHARE = (
     0.75  # of the distance at the speed before the gap: from its middle to 1.25 times it, at half the speed more
 )
-MIN_SPEED = 0.5  # metres a second, lower bound of that speed
 SPEED_NS = 1_000_000_000  # before a gap, over which it is measured: what covers a camera disturbs its last few poses
 REMEMBERED = 4096  # results of each kind since the last loop: a few megabytes
-FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
 NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two submaps half
+FEWEST = 8 * NEWEST  # keyframes, at which some are forgotten for the first time
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there: a second has fewer
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
@@ -42,7 +40,7 @@ class GapMotion:
     """The motion during a loss of tracking that a loop implies, compared with a prediction from the speed before."""
 
     deviation: float  # metres between the implied and the predicted position after the gap
-    tolerance: float  # metres, largest deviation of a robot that stops, turns or accelerates
+    tolerance: float  # metres, largest deviation of a robot that stops, turns or accelerates, without noise
     disturbed: float  # metres, the same if what covers the camera took its poses along in the second before
     distance: float  # metres of odometry between the gap and the loop's two ends
 
@@ -73,7 +71,7 @@ class KeyframeGraph:
     def __init__(self) -> None:
         self._nodes, self._loops = _Nodes(), _Loops()
         self._joined: dict[int, int] = {}  # submap -> number of the group of submaps that loops connect
-        self._forget_at = FIRST_FORGOTTEN
+        self._forget_at = FEWEST
         self.path = functools.lru_cache(REMEMBERED)(self._find_path)
 
     def _row(self, kf_id: int) -> int:
@@ -122,7 +120,7 @@ class KeyframeGraph:
         loops.ends[:] = np.searchsorted(rows, loops.ends)
         nodes.keep(rows)
         self.path.cache_clear()
-        self._forget_at = 2 * len(rows) + FIRST_FORGOTTEN
+        self._forget_at = 2 * len(rows) + FEWEST
         return rows
 
     def unbroken(self, a: int, b: int) -> bool:
@@ -134,8 +132,9 @@ class KeyframeGraph:
     def same_view(self, kf_id: int, factor: float = 1.0) -> list[int]:
         """Keyframes with about the same pose, this one included, oldest first; within `factor` times the distance."""
         nodes, row = self._nodes, self._row(kf_id)
-        rows, _, radians = self._around(nodes.anchored, row, nodes.frame, factor * SAME_METRES)
-        return nodes.kf_id[rows[(radians < SAME_RADIANS) | (rows == row)]].tolist()
+        metres = factor * 2 * SAME_VIEW_DEPTHS  # as in the map where shelves are two metres away
+        rows, _, radians = self._around(nodes.anchored, row, nodes.frame, metres)
+        return nodes.kf_id[rows[(radians < np.deg2rad(SAME_VIEW_DEG)) | (rows == row)]].tolist()
 
     def around(self, kf_id: int) -> tuple[I64, F64]:
         """Ids (K,) of all keyframes and their poses (K, 4, 4) in the camera of one, NaN where nothing leads there."""
@@ -195,8 +194,8 @@ class KeyframeGraph:
         assert before is not None and after is not None
         moved = before.a_T_b @ a_T_b @ after.a_T_b
         deviation = float(np.linalg.norm(moved[:3, 3] - 0.5e-9 * ns * velocity))
-        speed = max(float(np.linalg.norm(velocity)), MIN_SPEED)
-        tolerance = GAP_METRES + GAP_SHARE * 1e-9 * ns * speed
+        speed = max(float(np.linalg.norm(velocity)), 0.5)  # metres a second: a robot that stands may start
+        tolerance = GAP_SHARE * 1e-9 * ns * speed
         disturbed = tolerance + GAP_SHARE * 1e-9 * SPEED_NS * speed
         return GapMotion(deviation, tolerance, disturbed, before.metres + after.metres)
 

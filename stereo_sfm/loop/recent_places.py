@@ -20,7 +20,7 @@ NEWEST_KEYFRAMES = 12  # searched: where a camera can be after a short loss
 NEAREST = 2  # keyframes that are matched, of the most similar views, and others whose points are added to each one's
 # Radius of the search, as shares of the image's width. The last is the whole image, whatever is expected.
 WINDOWS = 0.05, 0.12, 0.3, 1.0
-MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners: a hypothesis, which tracking verifies
+MIN_INLIERS = 12  # and half of the matched corners: a hypothesis, which tracking verifies
 
 
 class RecentPlaces:
@@ -79,7 +79,7 @@ class RecentPlaces:
         if start is None:
             return None
         pose = refine_pose(start, matches, rig, sigma_px)
-        enough = pose.inlier.sum() >= max(MIN_INLIERS, MIN_INLIER_SHARE * matches.size)
+        enough = pose.inlier.sum() >= max(MIN_INLIERS, 0.5 * matches.size)
         return pose.b_T_a if enough else None
 
     def _order(self, expected: F64) -> list[Keyframe]:

@@ -18,7 +18,6 @@ from stereo_sfm.types import F64, I64, Keyframe
 
 MIN_CORNERS = 20  # of a keyframe with which a search is worth it: a loop across directions needs twice as many
 SAMPLES = 24  # corners of a keyframe that stand for what its views show: their overlap is a mean of them
-REACH = 2.0  # of a camera whose views may show the same fronts: in median distances of what its own show
 MIN_OVERLAP = 0.2  # of two keyframes' views, of at most 1
 SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it
 TURNED = np.cos(np.deg2rad(60.0))  # of the optical axes of keyframes that only views to the side can compare
@@ -72,7 +71,7 @@ class Fronts(Columns):
                 camera, NaN where unknown.
         """
         apart = np.linalg.norm(cam_T_kf[:, :3, 3], axis=1)
-        reach = REACH * float(np.median(np.linalg.norm(front, axis=1)))
+        reach = 2 * float(np.median(np.linalg.norm(front, axis=1)))  # of views that may show the same fronts
         rows = np.flatnonzero((cam_T_kf[:, 2, 2] < TURNED) & (apart < reach))
         there, here = self.points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
         back = se3.inverse(cam_T_kf[rows])

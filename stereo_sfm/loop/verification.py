@@ -21,8 +21,7 @@ from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.types import F64, I64, Keyframe
 
 GUIDED = (12.0, 4), (6.0, 10)  # rounds of guided matching: radius of the search in px, maximum of iterations
-FIRST_SHARE = 0.2  # of the required matches that the candidate alone must have: the keyframes around it add the rest
-RANSAC_SHARE = 0.4  # of the required inliers that the pose from three points must have: guided matching finds more
+FIRST_SHARE = 0.4  # of the required inliers that the pose from three points must have: guided matching finds more
 GRID = (8, 6)  # columns, rows of `LoopConfig.min_cells`
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 
@@ -52,7 +51,8 @@ def looks_alike(view: PlaceView, candidate: Keyframe, config: LoopConfig) -> boo
     matched, _ = binary.match_descriptors(
         descriptors, candidate.corners.descriptors, None, config.max_distance_bits, config.match_ratio
     )
-    return len(matched) >= FIRST_SHARE * config.min_match_fraction * len(descriptors)
+    least = 0.5 * FIRST_SHARE * config.min_match_fraction  # the keyframes around it add the rest
+    return len(matched) >= least * len(descriptors)
 
 
 def verify(
@@ -79,7 +79,7 @@ def verify(
     if start is None:
         return rejection("no_pose")
     agree = int(consistent(start, matches, rig, config.sigma_px).sum())
-    if agree < RANSAC_SHARE * max(config.min_inliers, config.min_inlier_share * len(corners_b)):
+    if agree < FIRST_SHARE * max(config.min_inliers, config.min_inlier_share * len(corners_b)):
         return rejection("too_few_inliers", agree)
     pose = refine_pose(start, matches, rig, config.sigma_px, GUIDED[0][1])
     return verify_near(pose.b_T_a, view, cloud, rig, config, move_points)

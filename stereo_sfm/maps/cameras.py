@@ -19,12 +19,9 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, RIG_TERMS
 
 KEY = "stereo_sfm_map_cameras"
-# Differences that are not worth a word, below what any calibration knows: px of focal lengths and principal points,
-# share of the baseline, degrees.
-SAME_PX, SAME_SHARE, SAME_DEG = 1e-3, 1e-4, 1e-3
-# What self-calibration may change of a rig, about a standard deviation of its prior (`rig_window.PRIOR`): degrees,
-# shares of the baseline and of the right focal length.
-CORRECTED_DEG, CORRECTED_SHIFT, CORRECTED_FOCAL = 0.6, 0.02, 0.01
+# Differences that are not worth a word, as radians or shares of the focal length or half the baseline: below what any
+# calibration knows; and what self-calibration may change, a standard deviation of its prior (`rig_window.PRIOR`).
+SAME, CORRECTED = 1e-4, 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +58,14 @@ def difference(a: Rig, b: Rig, corrected: bool = False) -> str:
 
     Args: corrected, what self-calibration may change does not count.
     """
+    limit = CORRECTED if corrected else SAME
     out = [f"serial number {b.serial} instead of {a.serial}"] if a.serial and b.serial and a.serial != b.serial else []
     out += [f"{_kind(b)} instead of {_kind(a)}"] if _kind(a) != _kind(b) else []
     for side, x, y in (("left", a.left, b.left), ("right", a.right, b.right)):
         if x is not None and y is not None:
-            out += _lens_difference(side, x, y, corrected and side == "right")
+            out += _lens_difference(side, x, y, limit if side == "right" else SAME)
     if a.stereo and b.stereo:
-        out += _pose_difference(a, b, corrected)
+        out += _pose_difference(a, b, limit)
     return ", ".join(out)
 
 
@@ -75,33 +73,32 @@ def _kind(rig: Rig) -> str:
     return "a depth camera" if rig.depth else "two cameras" if rig.stereo else "one camera"
 
 
-def _lens_difference(side: str, a: Camera, b: Camera, corrected: bool) -> list[str]:
+def _lens_difference(side: str, a: Camera, b: Camera, limit: float) -> list[str]:
     if a.model != b.model:
         return [f"{side} lens {b.model} instead of {a.model}"]
     if a.size != b.size:
         return [f"{side} image {b.width}x{b.height} instead of {a.width}x{a.height}"]
     out: list[str] = []
-    limit = CORRECTED_FOCAL * a.fx if corrected else SAME_PX
-    if max(abs(a.fx - b.fx), abs(a.fy - b.fy)) > limit:
+    if max(abs(a.fx - b.fx), abs(a.fy - b.fy)) > limit * a.fx:
         out.append(f"{side} focal length {b.fx:.2f} instead of {a.fx:.2f} px")
-    if max(abs(a.cx - b.cx), abs(a.cy - b.cy)) > (np.deg2rad(CORRECTED_DEG) * a.fx if corrected else SAME_PX):
+    if max(abs(a.cx - b.cx), abs(a.cy - b.cy)) > limit * a.fx:
         out.append(f"{side} principal point {b.cx:.2f} {b.cy:.2f} instead of {a.cx:.2f} {a.cy:.2f}")
     if not np.allclose(a.params[4:], b.params[4:], rtol=1e-6, atol=1e-9):
         out.append(f"another distortion of the {side} lens")
     return out
 
 
-def _pose_difference(a: Rig, b: Rig, corrected: bool) -> list[str]:
-    turned = float(np.rad2deg(se3.extent(se3.inverse(a.left_T_right) @ b.left_T_right)[1]))
+def _pose_difference(a: Rig, b: Rig, limit: float) -> list[str]:
+    turned = float(se3.extent(se3.inverse(a.left_T_right) @ b.left_T_right)[1])
     moved = float(np.linalg.norm(a.left_T_right[:3, 3] - b.left_T_right[:3, 3]))
     out: list[str] = []
-    if moved > (CORRECTED_SHIFT if corrected else SAME_SHARE) * max(a.baseline, 1e-6):
-        if abs(a.baseline - b.baseline) > SAME_SHARE * a.baseline:
+    if moved > 2 * limit * max(a.baseline, 1e-6):
+        if abs(a.baseline - b.baseline) > 2 * SAME * a.baseline:
             out.append(f"baseline {1e3 * b.baseline:.1f} instead of {1e3 * a.baseline:.1f} mm")
         else:
             out.append(f"the right camera {1e3 * moved:.1f} mm elsewhere")
-    if turned > (CORRECTED_DEG if corrected else SAME_DEG):
-        out.append(f"the right camera turned by {turned:.3f} deg")
+    if turned > limit:
+        out.append(f"the right camera turned by {np.rad2deg(turned):.3f} deg")
     return out
 
 

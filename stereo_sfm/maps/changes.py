@@ -12,10 +12,8 @@ from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.update import Update
 from stereo_sfm.types import F64, I64, Bool
 
-CELL = 1.0  # metres: a section of a shelf
 ENOUGH = 8  # points of the session in a cell that was looked at, of earlier sessions in one that the map knew
 CHANGED = 0.35  # of the usual share of points found again, below which a cell has changed
-SIGMAS = 2.0  # standard deviations of a count by which it must miss the usual number
 BESIDE_M = 3.0  # metres from an aisle's line to its shelves: wide aisles have four to six
 NEAR_M = 6.0  # metres from a keyframe; points farther away are too uncertain
 VIEWS = 3  # keyframes that see a point that counts: one by chance is seen by fewer
@@ -23,7 +21,7 @@ NEW, OTHER = "new", "changed"
 
 
 def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, float]]:
-    """Squares of CELL metres on the floor whose shelves are new to the map or show other things: kind, x, y (middle).
+    """Square metres of the floor whose shelves are new to the map or show other things: kind, x, y (middle).
 
     Where a session finds again far fewer of its points than it usually does, although it sees that square and the map
     knew it, other things stand there.
@@ -36,16 +34,16 @@ def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, fl
     solid = (points[:, 2] > LOW) & (points[:, 2] < HIGH)
     ours = sessions[s.obs_kf] == update.session
     mine, before = (_often(s.obs_pt[near & by], len(s.pt_ids)) & solid for by in (ours, ~ours))
-    cell = np.floor(points[:, :2] / CELL).astype(np.int64)
+    cell = np.floor(points[:, :2]).astype(np.int64)
     cells, which = np.unique(cell, axis=0, return_inverse=True)
     seen, known, again = (np.bincount(which[rows], minlength=len(cells)) for rows in (mine, before, mine & before))
     looked = (seen >= ENOUGH) & (known >= ENOUGH)
     usual = float(np.median(again[looked] / seen[looked])) if looked.any() else 0.0
     missing = usual * seen - again
-    other = looked & (again < CHANGED * usual * seen) & (missing > SIGMAS * np.sqrt(usual * seen))
+    other = looked & (again < CHANGED * usual * seen) & (missing > 2 * np.sqrt(usual * seen))  # sigmas of a count
     new = (seen >= ENOUGH) & (known < ENOUGH)
     rows = np.flatnonzero(new | other).tolist()
-    return [(NEW if new[k] else OTHER, *((cells[k] + 0.5) * CELL).tolist()) for k in rows]
+    return [(NEW if new[k] else OTHER, *(cells[k] + 0.5).tolist()) for k in rows]
 
 
 def _often(rows: I64, count: int) -> Bool:
@@ -72,16 +70,16 @@ def _where(xy: F64, aisles: Sequence[Aisle]) -> tuple[str, float, float]:
     best, text, middle, least = BESIDE_M, f"y {xy[0, 1]:.1f} m, x ", float(xy[0, 0]), -np.inf
     for aisle in aisles:
         along, left = (float(v[0]) for v in aisle.place(xy))
-        if -0.5 * CELL <= along <= aisle.length + 0.5 * CELL and abs(left) < best:
+        if -0.5 <= along <= aisle.length + 0.5 and abs(left) < best:
             best = abs(left)
             text, middle, least = f"{aisle.name}, {'left' if left > 0 else 'right'}, ", along, 0.0
-    return text, max(middle - 0.5 * CELL, least), max(middle + 0.5 * CELL, least)
+    return text, max(middle - 0.5, least), max(middle + 0.5, least)
 
 
 def _together(parts: list[tuple[float, float]]) -> list[tuple[float, float]]:
     out: list[tuple[float, float]] = []
     for begin, end in parts:
-        if out and begin <= out[-1][1] + 0.5 * CELL:
+        if out and begin <= out[-1][1] + 0.5:
             out[-1] = out[-1][0], max(end, out[-1][1])
         else:
             out.append((begin, end))

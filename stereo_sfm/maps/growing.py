@@ -20,7 +20,7 @@ from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.maps.update import in_frame_of, without_superseded
 from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult
 
-_FRACTION, _ODD = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)  # of the golden ratio, a large prime
+_FRACTION = np.uint64(0x9E3779B97F4A7C15)  # of the golden ratio: it scatters equal differences
 
 
 class GrowingMap:
@@ -221,4 +221,4 @@ def _keys(kf_ids: I64, uv: F64) -> np.ndarray:
     """(M,) uint64 that tells a sighting: the keyframe and the pixel, as the map's files have it."""
     bits = np.ascontiguousarray(uv, np.float32).view(np.uint32).astype(np.uint64)
     pixel = (bits[:, 0] << np.uint64(32)) | bits[:, 1]
-    return pixel * _FRACTION + kf_ids.astype(np.uint64) * _ODD
+    return pixel * _FRACTION + kf_ids.astype(np.uint64)

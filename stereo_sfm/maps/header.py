@@ -10,8 +10,7 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_text
 
-# Of the files: 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions.
-OLDEST, VERSION = 2, 5
+VERSION = 5  # 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 
@@ -50,7 +49,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
         version = head["version"] if head["kind"] == KIND else None
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None
-    if version not in range(OLDEST, VERSION + 1):
+    if version not in range(2, VERSION + 1):
         raise StereoSfmError(
             f"the map {folder} is version {version}, this program reads version {VERSION}: make the map again, or "
             "use the stereo-sfm that wrote it"
@@ -64,10 +63,3 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(checksums, dict) or not all(isinstance(checksums.get(name), str) for name in files):
         raise damaged(folder, "map.json lacks checksums")
     return head
-
-
-def check_counts(folder: Path, head: dict[str, Any], counts: dict[str, int]) -> None:
-    """Raises StereoSfmError where the counts in map.json and in the files differ."""
-    for name in COUNTS:
-        if head[name] != counts[name]:
-            raise damaged(folder, f"map.json says {head[name]} {name}, the files have {counts[name]}")

@@ -21,7 +21,6 @@ MIN_STEPS, MOST_STEPS = 10, 1000  # from which their scatter is known; that are 
 UPRIGHT_RAD = np.deg2rad(
     5.0
 )  # standard deviation of a roll about which nothing is known: cameras are mounted without measuring
-LARGEST_RAD = np.deg2rad(60.0)  # beyond that the camera does not stand upright: up and down may be confused
 ENOUGH_RAD = np.deg2rad(0.2)  # standard deviation of the pitch: 3 mm of height in a metre
 LEAST = np.array([1e-3, np.deg2rad(0.02), 1e-3]) ** 2  # variances (m^2, rad^2, m^2) below which no odometry is
 FLOOR_RANGE_M = 5.0  # to points of the floor: farther ones are too uncertain for its level
@@ -125,7 +124,7 @@ class MountingEstimate:
             values, vectors = np.linalg.eigh(hessian)
             up = vectors[:, 0] * (-1.0 if vectors[1, 0] > 0 else 1.0)
             hessian -= values[0] * np.eye(3)
-        if -up[1] < np.cos(LARGEST_RAD):
+        if -up[1] < 0.5:  # tilted by more than 60 degrees: up and down may be confused
             return None
         ahead = np.cross(right, up) / np.linalg.norm(np.cross(right, up))
         across = np.stack([ahead, np.cross(up, ahead)])

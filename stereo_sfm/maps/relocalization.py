@@ -34,8 +34,7 @@ from stereo_sfm.types import F64, I64, Keyframe
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: lamps and products repeat at larger steps
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
 MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
-# Places that are verified for an image, and those beside, where no confident one ends the search.
-PLACES, SIDE_PLACES = 16, 12
+PLACES = 16  # that are verified for an image, and for its side views, where no confident one ends the search
 PLACE_KEYFRAMES = 6  # whose points form a place
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
@@ -137,10 +136,12 @@ class Relocalizer:
             return ahead
         found_beside, reason = self._search(keyframe, True)
         beside = self._choose(found_beside, reason)
-        if beside.found and self._is_turned(beside):
-            return beside
         if beside.found:
-            beside = self._with_ahead(keyframe, beside)
+            row = int(np.searchsorted(self.map.kf_ids, beside.kf_id))
+            if (se3.inverse(self.map.map_T_kf[row]) @ beside.map_T_cam)[2, 2] < TURNED:  # nothing ahead to compare
+                return beside
+            agreeing = self._verify_near(keyframe, beside.map_T_cam, row, False).inliers
+            beside = dataclasses.replace(beside, others=agreeing)
             found_beside = [beside]
             if self._choose([beside, *found_ahead], "") is beside:
                 return beside
@@ -161,7 +162,10 @@ class Relocalizer:
         for place in sorted((x for x in found if x.found), key=lambda x: -x.agreeing):
             if len(places) < CLOSER_PLACES and all(_distinct(place, other) for other in places):
                 places.append(place)
-        weights = [self._weights(keyframe, sideways) for sideways in (False, True)]
+        weights: list[F64] = []  # (N,) of each row of a view: of corners by how rare their words are, of points zero
+        for words, sideways in zip(self._vocabularies, (False, True), strict=True):
+            view = self._view(keyframe, sideways)
+            weights.append(np.where(view.corner, words.idf[words.look_up(view.descriptors)] ** 2, 0.0))
         evidence = [self._evidence(keyframe, weights, place) for place in places]
         order = np.argsort(-np.array(evidence), kind="stable").tolist()
         if len(order) > 1 and evidence[order[1]] > AMBIGUITY_RATIO * evidence[order[0]]:
@@ -169,12 +173,6 @@ class Relocalizer:
         if not order or evidence[order[0]] < CLOSER_SHARE * sum(float(w.sum()) for w in weights):
             return not_found("ambiguous")
         return places[order[0]]
-
-    def _weights(self, keyframe: Keyframe, sideways: bool) -> F64:
-        """(N,) of each row of a view: of corners by how rare their words are, of points zero."""
-        view, words = self._view(keyframe, sideways), self._vocabularies[sideways]
-        word = words.look_up(view.descriptors)
-        return np.where(view.corner, words.idf[word] ** 2, 0.0)
 
     def _evidence(self, keyframe: Keyframe, weights: list[F64], place: Location) -> float:
         """Weight of the corners ahead and beside that agree with a place, from any of the keyframes around it."""
@@ -187,7 +185,11 @@ class Relocalizer:
     def _refined(self, keyframe: Keyframe, place: Location) -> Location:
         """The pose from all that agrees with it ahead and beside, as the nearest keyframe of the map sees it."""
         row = int(self._nearest(place.map_T_cam, 1)[0])
-        together = joined([self._matches(keyframe, place.map_T_cam, row, sideways) for sideways in (False, True)])
+        parts: list[Matches] = []
+        for sideways in (False, True):
+            rows_a, rows_b = self._verify_near(keyframe, place.map_T_cam, row, sideways).rows.T
+            parts.append(pair(self._view(keyframe, sideways), self._cloud(row, sideways), rows_b, rows_a))
+        together = joined(parts)
         if together.size < self.config.min_inliers:
             return place
         b_T_a = se3.inverse(place.map_T_cam) @ self.map.map_T_kf[row]
@@ -197,29 +199,9 @@ class Relocalizer:
             return place
         return dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
 
-    def _matches(self, keyframe: Keyframe, map_T_cam: F64, row: int, sideways: bool) -> Matches:
-        """What agrees with a pose."""
-        rows_a, rows_b = self._verify_near(keyframe, map_T_cam, row, sideways).rows.T
-        return pair(self._view(keyframe, sideways), self._cloud(row, sideways), rows_b, rows_a)
-
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
         return ahead.confident or ahead.others < 0 or ahead.others >= self._side_inliers
-
-    def _row(self, place: Location) -> int:
-        """Of the keyframe that a location was found with."""
-        return int(np.searchsorted(self.map.kf_ids, place.kf_id))
-
-    def _is_turned(self, place: Location) -> bool:
-        """Whether the camera looks another way than the keyframe, so that only views to the side can be compared."""
-        kf_T_cam = se3.inverse(self.map.map_T_kf[self._row(place)]) @ place.map_T_cam
-        return bool(kf_T_cam[2, 2] < TURNED)
-
-    def _with_ahead(self, keyframe: Keyframe, beside: Location) -> Location:
-        """What is ahead says to a pose found by the shelves beside."""
-        row = self._row(beside)
-        ahead = self._verify_near(keyframe, beside.map_T_cam, row, False).inliers
-        return dataclasses.replace(beside, others=ahead)
 
     def _with_beside(self, keyframe: Keyframe, row: int, ahead: Location) -> Location:
         """What the shelves beside say to a pose found ahead: rows of lamps look alike one lamp further on, too."""
@@ -238,7 +220,7 @@ class Relocalizer:
         bag = self._vocabularies[sideways].bag((keyframe.sides if sideways else keyframe.corners).descriptors)
         found: list[Location] = []
         reason = "no_candidate"
-        for row in self._places(self._databases[sideways].scores(bag))[: SIDE_PLACES if sideways else None]:
+        for row in self._places(self._databases[sideways].scores(bag)):
             rng = np.random.default_rng([config.seed, row])
             verdict = verify(view, self._cloud(row, sideways), self._rig, config, rng, move_points=False)
             if verdict.reason:

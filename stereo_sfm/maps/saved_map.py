@@ -23,7 +23,7 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.cameras import MapCamera, cameras_text, difference, read_cameras, unified
 from stereo_sfm.maps.columns import COLUMNS, KEYS, check_columns
-from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
+from stereo_sfm.maps.header import COUNTS, checksum, damaged, read_header, write_header
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import F64, I64, RIG_TERMS, MapUpdate, Trajectory
 
@@ -174,7 +174,10 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
         cameras.update(dict.fromkeys(saved.session_ids, own))
     if not cameras.keys() >= set(saved.session_ids):
         raise damaged(folder, f"{CAMERAS} lacks a session")
-    check_counts(folder, head, _counts(saved))
+    counts = _counts(saved)
+    for name in COUNTS:
+        if head[name] != counts[name]:
+            raise damaged(folder, f"map.json says {head[name]} {name}, the files have {counts[name]}")
     if rig is not None:
         _check_camera(folder, saved.cameras[saved.session_ids[-1]], rig)
     return saved
