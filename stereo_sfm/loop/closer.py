@@ -16,7 +16,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.cloud import Cloud, gather
+from stereo_sfm.loop.cloud import CLOUD_KEYFRAMES, Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.graph import REMEMBERED, KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
@@ -46,10 +46,7 @@ from stereo_sfm.mapping.culling import OF_A_VIEW, OF_EARLIER_VISITS, PASSED
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
-CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own: on both sides of it
-PLACE_RADIUS = (
-    3  # keyframes: candidates at most so many keyframes apart are one place: only the best of them is verified
-)
+PLACE_RADIUS = 3  # keyframes: of candidates at most so many apart, which are one place, only the best is verified
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the corresponding limit of the share of corners of its best keyframe, where several found it
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
@@ -287,7 +284,8 @@ class LoopCloser:
                 break
         rejected = tuple((c.kf_id, c.score, why) for c, why in zip(candidates, reasons, strict=True) if why)
         if accepted >= 0:
-            return self._accept(keyframe, candidates[accepted], verdicts[accepted], rejected)
+            result = self._accept(keyframe, candidates[accepted], verdicts[accepted])
+            return dataclasses.replace(result, rejected=rejected)
         return LoopResult.without_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
 
     def _verify(self, keyframe: Keyframe, candidate: Candidate) -> Verdict:
@@ -422,13 +420,7 @@ class LoopCloser:
         implied = back.a_T_b @ new.candidate_T_kf @ ahead.a_T_b
         return within(se3.inverse(earlier.candidate_T_kf) @ implied, AGREE_METRES, AGREE_DEGREES)
 
-    def _accept(
-        self,
-        keyframe: Keyframe,
-        candidate: Candidate,
-        verdict: Verdict,
-        rejected: tuple[tuple[int, float, str], ...],
-    ) -> LoopResult:
+    def _accept(self, keyframe: Keyframe, candidate: Candidate, verdict: Verdict) -> LoopResult:
         candidate_T_kf = se3.inverse(verdict.b_T_a)
         self._graph.add_loop(candidate.kf_id, keyframe.kf_id, candidate_T_kf)
         self._store.merge(verdict.pairs)
@@ -446,6 +438,5 @@ class LoopCloser:
             inliers=verdict.inliers,
             score=candidate.score,
             reason="",
-            rejected=rejected,
             sightings=verdict.sightings,
         )

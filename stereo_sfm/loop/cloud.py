@@ -20,6 +20,7 @@ from stereo_sfm.types import F64, I64, Keyframe
 
 # Largest differences of one corner in two keyframes: of positions by stereo, of descriptors (as of points of the map).
 SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50
+CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a place's own: on both sides of it
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,8 @@ from stereo_sfm.mapping.culling import SAME_VIEW_DEG, SAME_VIEW_DEPTHS
 from stereo_sfm.types import F64, I64, Bool
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views, of shelves a few metres away
-GAP_SHARE = (
-    0.75  # of the distance at the speed before the gap: from its middle to 1.25 times it, at half the speed more
-)
+# Of the distance at the speed before the gap: from its middle to 1.25 times it, at half the speed more.
+GAP_SHARE = 0.75
 SPEED_NS = 1_000_000_000  # before a gap, over which it is measured: what covers a camera disturbs its last few poses
 REMEMBERED = 4096  # results of each kind since the last loop: a few megabytes
 NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two submaps half

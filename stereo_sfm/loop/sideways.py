@@ -16,8 +16,9 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F64, I64, Keyframe
 
-MIN_CORNERS = 20  # of a keyframe with which a search is worth it: a loop across directions needs twice as many
-SAMPLES = 24  # corners of a keyframe that stand for what its views show: their overlap is a mean of them
+# Of a keyframe with which a search is worth it: a loop across directions needs twice as many. So many stand for what
+# its views show: the overlap with another one's is a mean of them.
+MIN_CORNERS = 20
 MIN_OVERLAP = 0.2  # of two keyframes' views, of at most 1
 SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it
 TURNED = np.cos(np.deg2rad(60.0))  # of the optical axes of keyframes that only views to the side can compare
@@ -43,17 +44,17 @@ def with_neighbours(scores: F64) -> F64:
 
 
 def front_of(keyframe: Keyframe) -> F64:
-    """(SAMPLES, 3) corners of a keyframe's views, in its camera; NaN without views."""
+    """(MIN_CORNERS, 3) corners of a keyframe's views, in its camera; NaN without views."""
     points = keyframe.sides.points_cam
     if len(points) < MIN_CORNERS:
-        return np.full((SAMPLES, 3), np.nan)
-    return points[np.linspace(0, len(points) - 1, SAMPLES).astype(int)].astype(np.float64)
+        return np.full((MIN_CORNERS, 3), np.nan)
+    return points[np.linspace(0, len(points) - 1, MIN_CORNERS).astype(int)].astype(np.float64)
 
 
 class Fronts(Columns):
     """What the views of keyframes show, one row each."""
 
-    points: F64 = column(np.float64, np.nan, (SAMPLES, 3))  # in the keyframe's camera; NaN without views
+    points: F64 = column(np.float64, np.nan, (MIN_CORNERS, 3))  # in the keyframe's camera; NaN without views
 
     def __init__(self, camera: Camera) -> None:
         super().__init__()
@@ -73,14 +74,14 @@ class Fronts(Columns):
         apart = np.linalg.norm(cam_T_kf[:, :3, 3], axis=1)
         reach = 2 * float(np.median(np.linalg.norm(front, axis=1)))  # of views that may show the same fronts
         rows = np.flatnonzero((cam_T_kf[:, 2, 2] < TURNED) & (apart < reach))
-        there, here = self.points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
+        there, here = self.points[rows], np.broadcast_to(front, (len(rows), MIN_CORNERS, 3))
         back = se3.inverse(cam_T_kf[rows])
         overlap = (self._alike(cam_T_kf[rows], there) + self._alike(back, here)) / 2
         order = np.lexsort((rows, -overlap))
         return rows[order[overlap[order] > MIN_OVERLAP]].astype(np.int64)
 
     def _alike(self, b_T_a: F64, points: F64) -> F64:
-        """(R,) mean over points (R, SAMPLES, 3) in a: the ratio of their distances from a and b, 0 where b is blind."""
+        """(R,) mean over points (R, N, 3) in a: the ratio of their distances from a and b, 0 where b is blind."""
         moved = np.einsum("rij,rsj->rsi", b_T_a[:, :3, :3], points) + b_T_a[:, None, :3, 3]
         seen = self._camera.inside(self._camera.project(moved), 1.0)
         ratio = np.linalg.norm(moved, axis=2) / np.linalg.norm(points, axis=2)

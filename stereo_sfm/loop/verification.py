@@ -154,17 +154,8 @@ def refine_with_points(
 
 def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
     """Matches of rows of the camera's view and of the cloud."""
-    left_a, right_a = cloud.seen_by_centre(rows_a)
-    return Matches(
-        cloud.points[rows_a],
-        cloud.sigmas[rows_a],
-        view.uv_left[rows_b],
-        view.uv_right[rows_b],
-        view.points[rows_b],
-        view.sigmas[rows_b],
-        left_a,
-        right_a,
-    )
+    b = (column[rows_b] for column in (view.uv_left, view.uv_right, view.points, view.sigmas))
+    return Matches(cloud.points[rows_a], cloud.sigmas[rows_a], *b, *cloud.seen_by_centre(rows_a))
 
 
 def occupied_cells(uv: F64, size: tuple[int, int]) -> int:

@@ -104,12 +104,9 @@ def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int =
     tree = Vocabulary(
         np.concatenate(centroids), np.array(first_child, np.int32), counts, word, np.ones(len(leaves), np.float32)
     )
-    return Vocabulary(tree.centroids, tree.first_child, tree.child_count, tree.word, _idf(tree, images))
-
-
-def _idf(tree: Vocabulary, images: Sequence[U8]) -> F32:
     seen = _images_with(len(tree), [tree.words(descriptors)[0] for descriptors in images])
-    return np.log(np.maximum(len(images), 2) / np.maximum(seen, 1)).astype(np.float32)
+    idf = np.log(np.maximum(len(images), 2) / np.maximum(seen, 1)).astype(np.float32)
+    return dataclasses.replace(tree, idf=idf)
 
 
 def _images_with(count: int, images: Sequence[I32]) -> I64:

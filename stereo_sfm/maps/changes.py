@@ -10,7 +10,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.maps.floor import HIGH, LOW
 from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.update import Update
-from stereo_sfm.types import F64, I64, Bool
+from stereo_sfm.types import F64
 
 ENOUGH = 8  # points of the session in a cell that was looked at, of earlier sessions in one that the map knew
 CHANGED = 0.35  # of the usual share of points found again, below which a cell has changed
@@ -33,7 +33,8 @@ def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, fl
     near = np.linalg.norm(s.points[s.obs_pt] - centres[s.obs_kf], axis=1) < NEAR_M
     solid = (points[:, 2] > LOW) & (points[:, 2] < HIGH)
     ours = sessions[s.obs_kf] == update.session
-    mine, before = (_often(s.obs_pt[near & by], len(s.pt_ids)) & solid for by in (ours, ~ours))
+    views = [np.bincount(s.obs_pt[near & by], minlength=len(s.pt_ids)) for by in (ours, ~ours)]
+    mine, before = ((count >= VIEWS) & solid for count in views)
     cell = np.floor(points[:, :2]).astype(np.int64)
     cells, which = np.unique(cell, axis=0, return_inverse=True)
     seen, known, again = (np.bincount(which[rows], minlength=len(cells)) for rows in (mine, before, mine & before))
@@ -44,11 +45,6 @@ def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, fl
     new = (seen >= ENOUGH) & (known < ENOUGH)
     rows = np.flatnonzero(new | other).tolist()
     return [(NEW if new[k] else OTHER, *(cells[k] + 0.5).tolist()) for k in rows]
-
-
-def _often(rows: I64, count: int) -> Bool:
-    """(N,) which points are seen by several keyframes."""
-    return np.bincount(rows, minlength=count) >= VIEWS
 
 
 def describe_changes(cells: Sequence[tuple[str, float, float]], aisles: Sequence[Aisle]) -> list[str]:

@@ -20,7 +20,10 @@ THICK_M = 0.05  # metres, of a level: stereo points of a floor a metre or two aw
 def find_floor(s: MapSnapshot) -> F64:
     """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
     felt = s.down_sigma > 0  # gravity, where an IMU measured it
-    down = (s.map_T_kf[felt, :3, :3] @ s.down[felt, :, None])[..., 0].mean(0) if felt.any() else _upright(s)
+    if felt.any():
+        down = (s.map_T_kf[felt, :3, :3] @ s.down[felt, :, None])[..., 0].mean(0)
+    else:  # cameras stand upright, though they may look up or down while driving around
+        down = s.map_T_kf[:, :3, 1].mean(0)
     if np.linalg.norm(down) < 0.3:
         raise StereoSfmError(
             "no floor plan: the vertical direction is unknown, since the cameras look in all directions"
@@ -29,7 +32,7 @@ def find_floor(s: MapSnapshot) -> F64:
     centre = s.map_T_kf[:, :3, 3].mean(0)
     below = (s.points - centre) @ down
     down, depth = _floor_plane(s.points - centre, below > BELOW_M, down)
-    across = np.cross(down, [1.0, 0, 0]) if abs(down[0]) < 0.9 else np.cross(down, [0, 0, 1.0])
+    across = np.cross(down, [1.0, 0, 0]) if abs(down[0]) < 0.5 else np.cross(down, [0, 0, 1.0])
     x = across / np.linalg.norm(across)
     axes = np.stack([x, np.cross(-down, x), -down], axis=1)
     flat = (s.points - centre) @ axes[:, :2]
@@ -40,18 +43,13 @@ def find_floor(s: MapSnapshot) -> F64:
     return se3.from_rotation_translation(turned, centre + depth * down)
 
 
-def _upright(s: MapSnapshot) -> F64:
-    """(3,) mean direction down of cameras that stand upright, though they may look up or down while driving around."""
-    return s.map_T_kf[:, :3, 1].mean(0)
-
-
 def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
     """Normal (pointing down) and depth below the origin of the lowest well-filled plane."""
     depth = points[candidates] @ down
     if len(depth) < 20:
         return down, float(np.percentile(points @ down, 99)) if len(points) else 1.5
     level = floor_level(depth)
-    near, normal = points[candidates][np.abs(depth - level) < 0.08], down
+    near, normal = points[candidates][np.abs(depth - level) < THICK_M], down
     for _ in range(5):
         mean = near.mean(0)
         normal = np.linalg.svd(near - mean, full_matrices=False)[2][2]

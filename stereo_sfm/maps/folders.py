@@ -142,15 +142,11 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
                 both, vocabulary = [load_map(folders.map_in), saved], configured_vocabulary(config.loop)
                 saved = merge(both, vocabulary, config.loop, config.mapper, mapper.place()).saved
             except StereoSfmError as error:
-                out = _unused_name(out) if out.resolve() == folders.map_in.resolve() else out
+                if out.resolve() == folders.map_in.resolve():  # an unused name next to it
+                    names = (out.with_name(f"{out.name}_walk{k}") for k in itertools.count(1))
+                    out = next(name for name in names if not name.exists())
                 failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
         for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
             save_map(saved, folder)
     if failure:
         raise StereoSfmError(failure)
-
-
-def _unused_name(folder: Path) -> Path:
-    """An unused name next to a folder."""
-    names = (folder.with_name(f"{folder.name}_walk{k}") for k in itertools.count(1))
-    return next(name for name in names if not name.exists())

@@ -18,9 +18,8 @@ from stereo_sfm.types import F64, Keyframe
 
 STEP_M, STEP_RAD = 0.5, 0.2  # metres, radians between keyframes that are compared: long against errors of millimetres
 MIN_STEPS, MOST_STEPS = 10, 1000  # from which their scatter is known; that are kept
-UPRIGHT_RAD = np.deg2rad(
-    5.0
-)  # standard deviation of a roll about which nothing is known: cameras are mounted without measuring
+# Standard deviation of a roll about which nothing is known: cameras are mounted without measuring.
+UPRIGHT_RAD = np.deg2rad(5.0)
 ENOUGH_RAD = np.deg2rad(0.2)  # standard deviation of the pitch: 3 mm of height in a metre
 LEAST = np.array([1e-3, np.deg2rad(0.02), 1e-3]) ** 2  # variances (m^2, rad^2, m^2) below which no odometry is
 FLOOR_RANGE_M = 5.0  # to points of the floor: farther ones are too uncertain for its level

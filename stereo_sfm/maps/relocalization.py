@@ -14,7 +14,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
-from stereo_sfm.loop.cloud import Cloud, gather
+from stereo_sfm.loop.cloud import CLOUD_KEYFRAMES, Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of, widest
 from stereo_sfm.loop.sideways import (
@@ -35,7 +35,6 @@ SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: la
 AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
 MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
 PLACES = 16  # that are verified for an image, and for its side views, where no confident one ends the search
-PLACE_KEYFRAMES = 6  # whose points form a place
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
 
@@ -263,7 +262,7 @@ class Relocalizer:
         shared = (self._seen[[row]] @ self._sees).toarray()[0]  # points that each keyframe shares with this one
         shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
-        order = np.argsort(-shared, kind="stable")[:PLACE_KEYFRAMES]
+        order = np.argsort(-shared, kind="stable")[: 1 + CLOUD_KEYFRAMES]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
         own = [self._own[k] for k in order.tolist()]
