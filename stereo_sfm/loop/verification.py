@@ -154,8 +154,9 @@ def refine_with_points(
 
 def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
     """Matches of rows of the camera's view and of the cloud."""
-    b = (column[rows_b] for column in (view.uv_left, view.uv_right, view.points, view.sigmas))
-    return Matches(cloud.points[rows_a], cloud.sigmas[rows_a], *b, *cloud.seen_by_centre(rows_a))
+    left, right, points, sigmas = (c[rows_b] for c in (view.uv_left, view.uv_right, view.points, view.sigmas))
+    known_a, seen_a = (cloud.points[rows_a], cloud.sigmas[rows_a]), cloud.seen_by_centre(rows_a)
+    return Matches(*known_a, left, right, points, sigmas, *seen_a)
 
 
 def occupied_cells(uv: F64, size: tuple[int, int]) -> int:
