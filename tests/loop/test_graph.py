@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.graph import FIRST_FORGOTTEN, KeyframeGraph
+from stereo_sfm.loop.graph import FEWEST, KeyframeGraph
 from stereo_sfm.types import F64
 
 
@@ -130,7 +130,7 @@ def test_keyframes_that_are_no_candidates_are_forgotten_and_paths_between_the_ot
         graph.forget()
     assert len(whole.around(k)[0]) == 60 * lap
     ids, _ = graph.around(k)
-    assert len(ids) < FIRST_FORGOTTEN + 200
+    assert len(ids) < FEWEST + 200
     assert np.isin(np.arange(lap), ids).all()
     for other in (5, 33, k - 7):
         path, expected = graph.path(other, k), whole.path(other, k)
@@ -151,7 +151,7 @@ def test_a_day_of_loops_to_an_earlier_part_of_the_odometry_needs_no_more_room() 
                 graph.add_loop(k % lap, k, at(0.0))
         graph.forget()
         rows.append(len(graph.around(k)[0]))
-    assert max(rows[len(rows) // 2 :]) <= max(rows[: len(rows) // 2]) < 2 * FIRST_FORGOTTEN
+    assert max(rows[len(rows) // 2 :]) <= max(rows[: len(rows) // 2]) < 2 * FEWEST
     path = graph.path(5, k)
     assert path is not None
     np.testing.assert_allclose(
