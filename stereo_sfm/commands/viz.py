@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING
 from stereo_sfm.commands._options import add_viewer_address, typed
 from stereo_sfm.errors import StereoSfmError, require
 
-MESH = "mesh.ply"  # in a folder of `dense`
-
 if TYPE_CHECKING:
     from stereo_sfm.calib.rig import Rig
     from stereo_sfm.drivers.source import Source
@@ -21,6 +19,8 @@ if TYPE_CHECKING:
     from stereo_sfm.messages import Sink
     from stereo_sfm.types import StereoImage, Trajectory
     from stereo_sfm.viz.sink import RerunSink
+
+MESH = "mesh.ply"  # in a folder of `dense`
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -169,10 +169,7 @@ def write_heights(path: Path, points: F64, plan: FloorPlan) -> None:
         return
     height, width = plan.image.shape
     at = np.floor((points[:, :2] - plan.origin) / plan.resolution).astype(np.int64)
-    column, row = (
-        at[:, 0].clip(0, width - 1),
-        height - 1 - at[:, 1].clip(0, height - 1),
-    )  # vertices lie beyond by a cell
+    column, row = at[:, 0].clip(0, width - 1), height - 1 - at[:, 1].clip(0, height - 1)  # some lie beyond by a cell
     top: F32 = np.full((height, width), -np.inf, np.float32)
     np.maximum.at(top, (row, column), points[:, 2].astype(np.float32))
     least, most = np.quantile(points[:, 2], [0.02, 0.98])

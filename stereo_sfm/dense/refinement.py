@@ -30,6 +30,7 @@ FARTHEST = 1.5  # px from the start: beyond, another match was found
 LEAST_GRADIENT = 0.03  # grey levels a pixel, root mean square in a window: below, rounding decides
 MATCH_PX = 1.5  # px, standard deviation of the matcher's disparity: holds windows with hardly any texture
 GREY_NOISE = 1.0  # grey levels, of a camera's pixel after rounding and resampling
+NO_VALUES = (0.0,) * 9  # sums of `plane_through`
 
 
 def refine(left: U8, right: U8, disparity: F32, step: int = 1) -> tuple[F32, F32]:
@@ -50,8 +51,19 @@ def refine(left: U8, right: U8, disparity: F32, step: int = 1) -> tuple[F32, F32
 
 
 @inner
-def plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd):
+def with_value(sums, k, x, y, d):
+    """The sums of `plane_through` with one more value, of weight k."""
+    n, sx, sy, sxx, syy, sxy, sd, sxd, syd = sums
+    return (
+        n + k, sx + k * x, sy + k * y, sxx + k * x * x, syy + k * y * y, sxy + k * x * y,
+        sd + k * d, sxd + k * x * d, syd + k * y * d,
+    )  # fmt: skip
+
+
+@inner
+def plane_through(sums):
     """Least squares from weighted sums over x, y and d: slopes along both, d at the origin, its variance."""
+    n, sx, sy, sxx, syy, sxy, sd, sxd, syd = sums
     mx, my, md = sx / n, sy / n, sd / n
     xx, yy, xy = sxx / n - mx * mx + FLAT_PX2, syy / n - my * my + FLAT_PX2, sxy / n - mx * my
     xd, yd = sxd / n - mx * md, syd / n - my * md
@@ -66,24 +78,15 @@ def _slopes(disparity, u, v):
     a = b = c = 0.0
     middle = disparity[v, u]
     for _ in range(FITS):
-        n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
+        sums = NO_VALUES
         for dy in range(-RADIUS, RADIUS + 1):
             for dx in range(-RADIUS, RADIUS + 1):
                 q = disparity[v + dy, u + dx] - middle
                 if not abs(q) <= SAME_SURFACE:
                     continue
                 off = (q - c - a * dx - b * dy) / ON_PLANE
-                k = 1.0 / (1.0 + off * off) ** 2
-                n += k
-                sx += k * dx
-                sy += k * dy
-                sxx += k * dx * dx
-                syy += k * dy * dy
-                sxy += k * dx * dy
-                sd += k * q
-                sxd += k * dx * q
-                syd += k * dy * q
-        a, b, c, _ = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
+                sums = with_value(sums, 1.0 / (1.0 + off * off) ** 2, dx, dy, q)
+        a, b, c, _ = plane_through(sums)
     return a, b
 
 

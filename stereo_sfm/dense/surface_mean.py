@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.dense.refinement import FITS, RADIUS, SAME_SURFACE, plane_through
+from stereo_sfm.dense.refinement import FITS, NO_VALUES, RADIUS, SAME_SURFACE, plane_through, with_value
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F32
 
@@ -47,7 +47,7 @@ def _means(disparity, sigma, pitch):
             a = b = c = variance = 0.0
             own = sigma[v, u] * sigma[v, u]
             for _ in range(FITS):
-                n = sx = sy = sxx = syy = sxy = sd = sxd = syd = 0.0
+                sums = NO_VALUES
                 for y in range(v - reach, v + reach + 1, pitch):
                     if y < 0 or y >= h:
                         continue
@@ -60,17 +60,8 @@ def _means(disparity, sigma, pitch):
                         dx, dy, square = x - u, y - v, sigma[y, x] * sigma[y, x]
                         off = q - c - a * dx - b * dy
                         fits = 1.0 + off * off / (WIDTH * WIDTH * (own + square))
-                        k = 1.0 / (square * fits * fits)
-                        n += k
-                        sx += k * dx
-                        sy += k * dy
-                        sxx += k * dx * dx
-                        syy += k * dy * dy
-                        sxy += k * dx * dy
-                        sd += k * q
-                        sxd += k * dx * q
-                        syd += k * dy * q
-                a, b, c, variance = plane_through(n, sx, sy, sxx, syy, sxy, sd, sxd, syd)
+                        sums = with_value(sums, 1.0 / (square * fits * fits), dx, dy, q)
+                a, b, c, variance = plane_through(sums)
             out[v, u] = middle + c
             spread[v, u] = math.sqrt(variance)
     return out, spread
