@@ -3,8 +3,7 @@
     STEREO_SFM_REAL=FOLDER STEREO_SFM_DATA=FOLDER python -m benchmarks changed -- [--only NAME]
 
 Each pair sequence of `benchmarks real` is written to STEREO_SFM_REAL/changed as folders of images with calibration and
-ground truth, which `benchmarks real` runs as further sequences. Backwards, a rolling shutter would read from below, so
-these are of global shutters. IMU samples are left out.
+ground truth, which `benchmarks real` runs as further sequences. All have global shutters. IMU samples are left out.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from _real_sequences import CHANGED, SEQUENCES, Sequence, real_root
+from _real_sequences import SEQUENCES, Sequence, real_root
 
 from stereo_sfm.calib.formats.native import write_native
 from stereo_sfm.calib.rig import Rig
@@ -24,7 +23,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.export.trajectories import write_tum
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.types import Trajectory
+from stereo_sfm.types import F64, Trajectory
 
 
 def flipped(camera: Camera, upside_down: bool) -> Camera:
@@ -39,10 +38,15 @@ def flipped(camera: Camera, upside_down: bool) -> Camera:
     )
 
 
+def flip(upside_down: bool) -> F64:
+    """(4, 4) from the axes of a camera to those of the flipped one, and back."""
+    return np.diag([-1.0, -1.0 if upside_down else 1.0, 1.0, 1.0])
+
+
 def flipped_rig(rig: Rig, upside_down: bool) -> Rig:
     """The right camera becomes the left one."""
     assert rig.right is not None
-    turn = np.diag([-1.0, -1.0 if upside_down else 1.0, 1.0, 1.0])
+    turn = flip(upside_down)
     return Rig(
         flipped(rig.right, upside_down), flipped(rig.left, upside_down),
         turn @ se3.inverse(rig.left_T_right) @ turn, name=rig.name,
@@ -51,7 +55,7 @@ def flipped_rig(rig: Rig, upside_down: bool) -> Rig:
 
 def flipped_truth(truth: Trajectory, rig: Rig, upside_down: bool) -> Trajectory:
     """Of the new left camera; mirrored, the world is mirrored, too."""
-    turn = np.diag([-1.0, -1.0 if upside_down else 1.0, 1.0, 1.0])
+    turn = flip(upside_down)
     poses = truth.poses @ rig.left_T_right @ turn
     return Trajectory(truth.stamp_ns, poses if upside_down else turn @ poses)
 
@@ -62,7 +66,6 @@ def write(sequence: Sequence, place: Path, out: Path, how: str) -> None:
     with open_source(str(place), place.parent / sequence.rig if sequence.rig else None) as source:
         rig, truth = source.rig, source.ground_truth
         images = [image for image in source if image.right is not None]
-    assert all(image.right is not None for image in images)
     first_ns, last_ns = images[0].stamp_ns, images[-1].stamp_ns
     for side in ("left", "right"):
         (out / side).mkdir(parents=True)
@@ -75,8 +78,8 @@ def write(sequence: Sequence, place: Path, out: Path, how: str) -> None:
             cv2.imwrite(str(out / side / f"{k:06d}.png"), pixels)
         times.append(last_ns - image.stamp_ns if how == "backwards" else image.stamp_ns - first_ns)
     np.savetxt(out / "times.txt", np.array(times) * 1e-9, fmt="%.9f")
-    write_native(flipped_rig(rig, how == "upside down") if how in axes else Rig(
-        rig.left, rig.right, rig.left_T_right, name=rig.name), out / "rig.yaml")  # fmt: skip
+    same = Rig(rig.left, rig.right, rig.left_T_right, name=rig.name)
+    write_native(flipped_rig(rig, how == "upside down") if how in axes else same, out / "rig.yaml")
     if truth is None:
         return
     if how == "backwards":
@@ -96,18 +99,16 @@ def main(args: list[str] | None = None) -> int:
     if real is None:
         print("set STEREO_SFM_REAL to the folder of the real sequences", file=sys.stderr)
         return 2
-    for sequence in SEQUENCES:
+    recorded = {s.name: s for s in SEQUENCES if not s.changed}
+    for new in (s for s in SEQUENCES if s.changed):
+        sequence, out = recorded[new.name.removesuffix(f" {new.changed}")], real / new.place
         place = sequence.path(real)
-        wanted = not options.only or any(sequence.name.startswith(name) for name in options.only)
-        if place is None or sequence.kind == "depth" or sequence.changed or not wanted:
-            continue
-        for how in CHANGED:
-            out = real / "changed" / f"{sequence.name}_{how.replace(' ', '_')}"
-            if not out.exists():
-                part = out.with_suffix(".part")
-                write(sequence, place, part, how)
-                part.rename(out)
-                print(out)
+        wanted = not options.only or any(new.name.startswith(name) for name in options.only)
+        if place is not None and wanted and not out.exists():
+            part = out.with_suffix(".part")
+            write(sequence, place, part, new.changed)
+            part.rename(out)
+            print(out)
     return 0
 
 

@@ -78,12 +78,12 @@ class SuddenTurns:
         if count < MIN_POINTS:
             return False
         last, self._last = self._last, turn
-        of_this, of_last = self._usual[:3, :3], self._usual[3:, 3:]
-        by = np.linalg.solve(of_last, self._usual[3:, :3]).T
-        expected, usual = by @ last, of_this - by @ self._usual[3:, :3] + covariance
+        of_this, of_last, both_ways = self._usual[:3, :3], self._usual[3:, 3:], self._usual[3:, :3]
+        by = np.linalg.solve(of_last, both_ways).T
+        expected, usual = by @ last, of_this - by @ both_ways + covariance
         # What goes back to where it was before the image before has not turned.
-        back = of_this + self._usual[:3, 3:] + self._usual[3:, :3] + of_last + covariance
-        goes_back = Estimate(turn + last, back).reach < Estimate(last, of_last).reach
+        of_sum = of_this + both_ways.T + both_ways + of_last + covariance
+        goes_back = Estimate(turn + last, of_sum).reach < Estimate(last, of_last).reach
         sudden = self._significant(turn - expected, usual) and not goes_back
         self._images = min(self._images + 1.0, REMEMBERED_IMAGES)
         both = np.concatenate([turn, last])
