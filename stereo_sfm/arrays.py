@@ -9,7 +9,7 @@ import io
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,8 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], compress: bool = True) -
                 npy.write_array(file, np.asanyarray(array), allow_pickle=False)
 
 
-def read_arrays(raw: bytes) -> dict[str, Any]:
-    """Every array of an npz file by name, writeable.
+def read_arrays(raw: bytes, names: Collection[str] = ()) -> dict[str, Any]:
+    """Arrays of an npz file by name, writeable. Args: names, of those to read, if not all.
 
     Raises:
         ValueError: not an npz file, damaged, or too large for its compressed size.
@@ -44,7 +44,8 @@ def read_arrays(raw: bytes) -> dict[str, Any]:
                 raise ValueError("its arrays are far larger than the file")
             if any(entry.compress_type not in _METHODS or entry.flag_bits & 1 for entry in entries):
                 raise ValueError("its arrays use an unknown compression")
-            return {entry.filename.removesuffix(".npy"): _array(archive.read(entry)) for entry in entries}
+            named = [(entry.filename.removesuffix(".npy"), entry) for entry in entries]
+            return {name: _array(archive.read(e)) for name, e in named if not names or name in names}
     except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, OSError, zlib.error, MemoryError) as error:
         raise ValueError(f"not an npz file, or a damaged one ({error})") from None
 

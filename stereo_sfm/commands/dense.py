@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
         options.output.mkdir(parents=True, exist_ok=True)
         with FolderLock(options.output, "choose another -o, or wait for its end"):
             bars = _Bars(options.quiet)
-            results, map_T_floor = build(given, options.output, options.voxel, options.jobs, bars, bands)
-            numbers = write_all(results, options.output, options.voxel, map_T_floor, bands)
+            volume = build(given, options.output, options.voxel, options.jobs, bars)
+            numbers = write_all(volume, options.output, bands)
             report = write_report(options.output, str(options.source), options.voxel, numbers)
     if not options.quiet:
         print(", ".join(f"{value:.0f} {name}" for name, value in numbers.items()))

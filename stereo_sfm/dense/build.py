@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,7 +24,7 @@ from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, with_partners
 from stereo_sfm.dense.surface import LEAST_VIEWS, Surface, extract
-from stereo_sfm.dense.volume import SIDE, Seen, contributes, cubes_of, fuse, touched
+from stereo_sfm.dense.volume import SIDE, Seen, contributes, fuse, touched
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import MODELS
@@ -35,6 +35,7 @@ from stereo_sfm.types import F64, U8, Bool
 T = TypeVar("T")
 R = TypeVar("R")
 VERSION = "5"  # of the files: grows when the same input gives other bits
+CubeIndex = tuple[int, int, int]
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)
 CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
@@ -50,7 +51,6 @@ class KeptDepth:
     floor_T_cam: F64
     session: int
     reach: float  # metres
-    cubes: tuple[tuple[int, int, int], ...]
 
     def place_key(self) -> str:
         """Changes with the image or its pose."""
@@ -58,46 +58,57 @@ class KeptDepth:
 
 
 @dataclass(frozen=True, eq=False)
-class CubeResult:
-    """What is kept of a cube besides its voxels."""
+class Volume:
+    """Cubes on disk, of which no more than one is read at a time."""
 
-    index: tuple[int, int, int]
-    surface: Surface
-    occupied: Bool  # (bands, 64, 64) columns along x, y with a surface in the band
-    free: Bool  # (bands, 64, 64) columns seen free at some height in the band
+    folder: Path
+    indices: list[CubeIndex]  # in order
+    voxel: float  # metres
+    map_T_floor: F64  # (4, 4)
+
+    def surfaces(self) -> Iterator[Surface]:
+        """Of each cube that has one."""
+        for _, data in self._read("cells", "vertices", "grey", "quads"):
+            if len(data["quads"]):
+                yield Surface(**data)
+
+    def columns(self, bands: Bands) -> Iterator[tuple[CubeIndex, Bool, Bool]]:
+        """Each cube's index, its columns (bands, 64, 64) along x, y with a surface in a band, and those seen free."""
+        for index, data in self._read("occupied", "free"):
+            height = (index[2] * SIDE + np.arange(float(SIDE))) * self.voxel
+            occupied, free = (_columns(np.unpackbits(data[name]), height, bands) for name in ("occupied", "free"))
+            yield index, occupied, free
+
+    def _read(self, *names: str) -> Iterator[tuple[CubeIndex, dict[str, Any]]]:
+        for index in self.indices:
+            path = self.folder / _cube_name(index)
+            data = _read(path, None, names)
+            if data is None:
+                raise _lost(path)
+            yield index, data
 
 
-def build(
-    given: DenseInput,
-    folder: Path,
-    voxel: float,
-    jobs: int,
-    report: Report = lambda *_: None,
-    bands: Bands = ROBOT,
-) -> tuple[list[CubeResult], F64]:
-    """All cubes, ordered by their index, and map_T_floor (4, 4).
+def build(given: DenseInput, folder: Path, voxel: float, jobs: int, report: Report = lambda *_: None) -> Volume:
+    """Make or go on with the depth images and the cubes of a folder.
 
     Args:
         given: the map and its images. folder: for the files; may hold those of an earlier run.
         voxel: metres. jobs: processes; the bits do not depend on them. report: called after each step.
-        bands: heights of the costmaps.
     """
     map_T_floor = find_floor(given.saved.snapshot)
     for name in ("depth", "cubes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     with _Workers(jobs) as workers:
-        kept = _depths(given, folder / "depth", voxel, map_T_floor, workers, report)
+        kept, cubes = _depths(given, folder / "depth", voxel, map_T_floor, workers, report)
         if not kept:
             raise StereoSfmError("no keyframe has depth: one camera needs keyframes 10 to 40 cm apart")
-        cubes = cubes_of([set(k.cubes) for k in kept])
-        seen_by = ([k for k in kept if contributes(k.floor_T_cam[:3, 3], k.reach, c, voxel)] for c in cubes)
-        tasks = [(c, views, folder / "cubes", voxel, bands) for c, views in zip(cubes, seen_by, strict=True)]
-        results: list[CubeResult] = []
-        for number, result in enumerate(workers.map(_cube, tasks), 1):
-            results.append(result)
-            report("cubes", number, len(tasks))
+        places, reach = np.stack([k.floor_T_cam[:3, 3] for k in kept]), np.array([k.reach for k in kept])
+        seen_by = ([kept[i] for i in np.flatnonzero(contributes(places, reach, c, voxel))] for c in cubes)
+        tasks = ((c, views, folder / "cubes", voxel) for c, views in zip(cubes, seen_by, strict=True))
+        for number, _ in enumerate(workers.map(_cube, tasks), 1):
+            report("cubes", number, len(cubes))
     _remove_others(folder / "cubes", {_cube_name(c) for c in cubes})
-    return results, map_T_floor
+    return Volume(folder / "cubes", cubes, voxel, map_T_floor)
 
 
 class _Workers:
@@ -139,7 +150,8 @@ def _one_thread() -> None:
 
 def _depths(
     given: DenseInput, folder: Path, voxel: float, map_T_floor: F64, workers: _Workers, report: Report
-) -> list[KeptDepth]:
+) -> tuple[list[KeptDepth], list[CubeIndex]]:
+    """The depth images, and the cubes in which they have surfaces, in order."""
     floor_T_map, sessions, count = se3.inverse(map_T_floor), given.saved.sessions, len(given.saved)
 
     def tasks() -> Iterator[Any]:
@@ -150,14 +162,16 @@ def _depths(
             now, others = found
             yield now, others, folder, voxel, floor_T_map @ now.map_T_cam, int(sessions[now.number])
 
-    kept: list[KeptDepth] = []
+    kept, cubes = list[KeptDepth](), set[CubeIndex]()
     for number, result in enumerate(workers.map(_depth, tasks()), 1):
-        kept += [result] if result is not None else []
+        if result is not None:
+            kept.append(result[0])
+            cubes |= result[1]
         report("depth images", number, count)
-    return kept
+    return kept, sorted(cubes)
 
 
-def _depth(task: Any) -> KeptDepth | None:
+def _depth(task: Any) -> tuple[KeptDepth, set[CubeIndex]] | None:
     if task is None:  # a keyframe that shows what another showed
         return None
     now, others, folder, voxel, floor_T_cam, session = task
@@ -169,7 +183,7 @@ def _depth(task: Any) -> KeptDepth | None:
             return None
         _write(path, key, _depth_columns(found))
     seen = Seen(found, floor_T_cam, session)
-    return KeptDepth(path, key, floor_T_cam, session, seen.reach(voxel), tuple(sorted(touched(seen, voxel))))
+    return KeptDepth(path, key, floor_T_cam, session, seen.reach(voxel)), touched(seen, voxel)
 
 
 def _depth_key(now: KeyframeImages, others: list[KeyframeImages]) -> str:
@@ -213,39 +227,33 @@ def some_depths(folder: Path, count: int) -> list[DepthImage]:
 def _cached_depth(path: Path, key: str) -> DepthImage:
     found = read_depth(path, key)
     if found is None:
-        raise StereoSfmError(f"{path} was removed or changed while it was used: run again")
+        raise _lost(path)
     return found
 
 
 # -- cubes ----------------------------------------------------------------------------------------------------------
 
 
-def _cube_name(index: tuple[int, int, int]) -> str:
+def _cube_name(index: CubeIndex) -> str:
     return "_".join(map(str, index)) + ".npz"
 
 
-def _cube(task: Any) -> CubeResult:
-    index, kept, folder, voxel, bands = task
+def _cube(task: Any) -> None:
+    index, kept, folder, voxel = task
     path = folder / _cube_name(index)
     key = hashlib.sha256("".join([VERSION, f"{voxel!r}", *(k.place_key() for k in kept)]).encode()).hexdigest()
-    data: dict[str, Any] | None = _read(path, key)
-    if data is None:
+    if _read(path, key) is None:
         cube = fuse(index, [Seen(_cached_depth(k.path, k.key), k.floor_T_cam, k.session) for k in kept], voxel)
         surface = extract(cube)
         own = np.s_[1 : SIDE + 1, 1 : SIDE + 1, 1 : SIDE + 1]
         seen = cube.views[own] >= LEAST_VIEWS
-        columns: dict[str, Any] = {
+        columns = {
             "cells": surface.cells, "vertices": surface.vertices, "grey": surface.grey, "quads": surface.quads,
             "occupied": np.packbits(seen & (np.abs(cube.distance[own]) < voxel)),
             "free": np.packbits(seen & (cube.distance[own] > voxel)),
             "distance": cube.distance[own].astype(np.float16), "weight": cube.weight[own],
         }  # fmt: skip
         _write(path, key, columns)
-        data = columns
-    surface = Surface(data["cells"], data["vertices"], data["grey"], data["quads"])
-    height = (index[2] * SIDE + np.arange(SIDE)) * voxel
-    occupied, free = (_columns(np.unpackbits(data[name]), height, bands) for name in ("occupied", "free"))
-    return CubeResult(index, surface, occupied, free)
 
 
 def _columns(voxels: U8, height: F64, bands: Bands) -> Bool:
@@ -264,6 +272,10 @@ def _remove_others(folder: Path, names: set[str]) -> None:
 # -- files ----------------------------------------------------------------------------------------------------------
 
 
+def _lost(path: Path) -> StereoSfmError:
+    return StereoSfmError(f"{path} was removed or changed while it was used: run again")
+
+
 def _write(path: Path, key: str, columns: dict[str, Any]) -> None:
     """Complete or not at all."""
     part = path.with_suffix(".part")
@@ -275,13 +287,13 @@ def _write(path: Path, key: str, columns: dict[str, Any]) -> None:
         raise
 
 
-def _read(path: Path, key: str | None) -> dict[str, Any] | None:
+def _read(path: Path, key: str | None, names: Sequence[str] = ()) -> dict[str, Any] | None:
     """The columns of a file; None where there is none, it is damaged, or it was made of something else.
 
-    `key`: of what it should be made of; None: of anything.
+    `key`: of what it should be made of; None: of anything. `names`: of columns, if not all.
     """
     try:
-        data = read_arrays(read_bytes(path))
+        data = read_arrays(read_bytes(path), names)
         return data if key is None or str(data["key"]) == key else None
     except (OSError, ValueError, KeyError):
         return None

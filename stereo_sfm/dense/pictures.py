@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from stereo_sfm.dense.depth import DepthImage
+from stereo_sfm.dense.surface import Surface
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.maps.floor import HIGH
 from stereo_sfm.types import F32, F64, I64, U8
@@ -21,38 +23,65 @@ AMBIENT = 0.55  # share of the light that reaches every face
 NEAR_M, FAR_M = 0.5, 6.0  # of the colours of depth images
 
 
-def write_mesh_pictures(folder: Path, points: F64, grey: U8, triangles: I64) -> None:
-    """mesh_height.png and mesh_grey.png: the mesh below a ceiling, coloured by height and by grey level."""
-    below = (points[triangles][:, :, 2] < HIGH).all(axis=1) if len(triangles) else np.zeros(0, bool)
-    triangles = triangles[below]
-    used = np.unique(triangles)
-    if not len(used):
-        return
-    low, high = np.quantile(points[used, 2], [0.02, 0.98])
-    share = np.clip((points[:, 2] - low) / max(high - low, 1e-3), 0, 1)
-    coloured = _turbo((255 * share).astype(np.uint8)[None])[0]
-    plain = np.repeat(grey[:, None], 3, axis=1)
-    for name, colours in (("mesh_height.png", coloured), ("mesh_grey.png", plain)):
-        _write(folder / name, render_mesh(points, colours, triangles))
+def write_mesh_pictures(
+    folder: Path, points: Iterable[F64], parts: Iterable[tuple[F64, Surface, I64]], heights: tuple[float, float]
+) -> None:
+    """mesh_height.png and mesh_grey.png: the mesh below a ceiling, coloured by height and by grey level.
+
+    Args:
+        points: (N, 3) m, all of the mesh in parts of any size.
+        parts: points (V, 3) m, with grey levels, and triangles (T, 3) of each cube.
+        heights: m, of the lowest and the highest colour.
+    """
+
+    def drawn() -> Iterator[tuple[F64, U8, I64]]:
+        for vertices, surface, triangles in parts:
+            below = (vertices[triangles][:, :, 2] < HIGH).all(axis=1)
+            coloured = height_colours(vertices[:, 2:], heights)[:, 0]
+            plain = np.repeat(surface.grey[:, None], 3, axis=1)
+            yield vertices, np.concatenate([coloured, plain], axis=1), triangles[below]
+
+    image = render_mesh((p[p[:, 2] < HIGH] for p in points), drawn())
+    if image is not None:
+        _write(folder / "mesh_height.png", image[..., :3])
+        _write(folder / "mesh_grey.png", image[..., 3:])
 
 
-def render_mesh(points: F64, colours: U8, triangles: I64, width: int = WIDTH_PX) -> U8:
-    """(H, W, 3) blue green red: faces that look at the viewer, shaded, on white. Args: (V, 3) m, (V, 3), (T, 3)."""
+def height_colours(z: F64, heights: tuple[float, float]) -> U8:
+    """(H, W, 3) blue green red. Args: (H, W) m; those of the first and the last colour."""
+    low, high = heights
+    share = np.clip((z - low) / max(high - low, 1e-3), 0, 1)
+    return _turbo((255 * share).astype(np.uint8))
+
+
+def render_mesh(points: Iterable[F64], parts: Iterable[tuple[F64, U8, I64]], width: int = WIDTH_PX) -> U8 | None:
+    """(H, W, C): faces that look at the viewer, shaded, on white; None where there are none.
+
+    Args:
+        points: (N, 3) m, what the picture holds.
+        parts: points (V, 3) m, their colours (V, C) and triangles (T, 3), one after the other.
+    """
     down, around = math.radians(DOWN_DEG), math.radians(AROUND_DEG)
     ahead = np.array([math.cos(down) * math.cos(around), math.cos(down) * math.sin(around), -math.sin(down)])
     right = np.array([math.sin(around), -math.cos(around), 0.0])
-    seen = points @ np.stack([right, np.cross(ahead, right), ahead], axis=1)
-    corner = seen[np.unique(triangles)]
-    low, high = corner.min(axis=0), corner.max(axis=0)
+    to_view = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for seen in (p @ to_view for p in points if len(p)):
+        low, high = np.minimum(low, seen.min(axis=0)), np.maximum(high, seen.max(axis=0))
     scale = (width - 1) / max(float(high[0] - low[0]), 1e-3)
-    height = min(2 * width, int(scale * float(high[1] - low[1])) + 1)
-    a, b, c = (points[triangles[:, k]] for k in range(3))
-    normals = np.cross(b - a, c - a)
-    facing = -(normals @ ahead) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
-    image = np.full((height, width, 3), 255, np.uint8)
-    depth = np.full((height, width), np.inf, np.float32)
-    at = (seen - low) * np.array([scale, scale, 1.0])
-    _rasterize(image, depth, at, triangles, colours, facing)
+    image = depth = None
+    for vertices, colours, triangles in parts:
+        if not len(triangles):
+            continue
+        if image is None or depth is None:
+            height = min(2 * width, int(scale * float(high[1] - low[1])) + 1)
+            image = np.full((height, width, colours.shape[1]), 255, np.uint8)
+            depth = np.full((height, width), np.inf, np.float32)
+        a, b, c = (vertices[triangles[:, k]] for k in range(3))
+        normals = np.cross(b - a, c - a)
+        facing = -(normals @ ahead) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+        at = (vertices @ to_view - low) * np.array([scale, scale, 1.0])
+        _rasterize(image, depth, at, triangles, colours, facing)
     return image
 
 
@@ -78,7 +107,7 @@ def _rasterize(image, depth, at, triangles, colours, facing):
                 z = p * at[i, 2] + q * at[j, 2] + r * at[k, 2]
                 if z < depth[y, x]:
                     depth[y, x] = z
-                    for n in range(3):
+                    for n in range(image.shape[2]):
                         mixed = p * colours[i, n] + q * colours[j, n] + r * colours[k, n]
                         image[y, x, n] = np.uint8(light * mixed)
 

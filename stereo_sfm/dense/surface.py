@@ -1,7 +1,7 @@
 """The surface of a distance field as quadrilaterals: one vertex in each cell that it crosses (Gibson, surface nets).
 
-The vertex is the mean of the crossings of the cell's edges. Cells have numbers of the whole volume, and both cubes at a
-border compute the same vertex of a cell, so meshes of cubes join by the numbers.
+The vertex is the mean of the crossings of the cell's edges. Cells have numbers of the whole volume, and all cubes at a
+border compute the same vertex of a cell, so meshes of cubes join by the numbers, one cube at a time in memory.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ class Surface(ReadOnly):
     vertices: F32  # (V, 3) in voxels
     grey: U8  # (V,)
     quads: I64  # (Q, 4) numbers of cells, counter-clockwise seen from before the surface
+
+    def triangles(self) -> I64:
+        """(T, 3) rows of its vertices."""
+        return np.searchsorted(self.cells, self.quads)[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def extract(cube: Cube) -> Surface:
@@ -99,12 +103,30 @@ def _numbers(cells: I64) -> I64:
     return (shifted[:, 0] * SPAN + shifted[:, 1]) * SPAN + shifted[:, 2]
 
 
-def joined(parts: list[Surface]) -> tuple[F32, U8, I64]:
-    """Vertices (V, 3) in voxels, grey levels (V,) and triangles (T, 3) of all cubes as one mesh."""
-    if not parts:
-        return np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), np.zeros((0, 3), np.int64)
-    cells, first = np.unique(np.concatenate([p.cells for p in parts]), return_index=True)
-    vertices = np.concatenate([p.vertices for p in parts])[first]
-    grey = np.concatenate([p.grey for p in parts])[first]
-    quads = np.searchsorted(cells, np.concatenate([p.quads for p in parts]))
-    return vertices, grey, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+class Numbering:
+    """Numbers of vertices in the mesh of all cubes, which are added in order of their index.
+
+    A vertex that several cubes list gets its number at the first. Cubes list cells of their own and of those before
+    them along the axes, so cells at upper borders of two layers of cubes across x are all that is remembered.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[int, int] = {}  # numbers of vertices by cells
+        self._layer = self._count = 0
+
+    def add(self, surface: Surface) -> tuple[Bool, I64]:
+        """Whether each vertex (V,) of a cube, at least one, is new, and its number (V,) in the mesh."""
+        cells = surface.cells
+        if cells[-1] // SPAN**2 // SIDE > self._layer:
+            self._layer = cells[-1] // SPAN**2 // SIDE
+            first = (self._layer * SIDE - 1) * SPAN**2
+            self._known = {cell: number for cell, number in self._known.items() if cell >= first}
+        border = np.logical_or.reduce([cells // SPAN**axis % SIDE == SIDE - 1 for axis in range(3)])
+        shared = cells[border].tolist()
+        numbers = np.full(len(cells), -1, np.int64)
+        numbers[border] = [self._known.get(cell, -1) for cell in shared]
+        new = numbers < 0
+        numbers[new] = self._count + np.arange(new.sum())
+        self._count += int(new.sum())
+        self._known.update(zip(shared, numbers[border].tolist(), strict=True))
+        return new, numbers

@@ -65,11 +65,11 @@ def touched(seen: Seen, voxel: float) -> set[tuple[int, int, int]]:
     return {(int(x), int(y), int(z)) for x, y, z in np.unique(at, axis=0)}
 
 
-def contributes(seen_from: F64, reach: float, index: tuple[int, int, int], voxel: float) -> bool:
-    """Whether a camera at `seen_from` (3,) that sees as far as `reach` can say anything about a cube."""
+def contributes(seen_from: F64, reach: F64, index: tuple[int, int, int], voxel: float) -> Bool:
+    """(N,) whether cameras at `seen_from` (N, 3) that see as far as `reach` (N,) can say anything about a cube."""
     centre = (np.array(index) + 0.5) * SIDE * voxel
     radius = 0.5 * math.sqrt(3) * (SIDE + 2 * APRON) * voxel + TRUNCATION * voxel
-    return bool(np.linalg.norm(centre - seen_from) <= reach + radius)
+    return np.linalg.norm(centre - seen_from, axis=1) <= reach + radius
 
 
 def fuse(index: tuple[int, int, int], images: Sequence[Seen], voxel: float) -> Cube:
@@ -159,11 +159,6 @@ def _integrate(distance, weight, views, grey, ranges, sigmas, image, coarse, mod
                             weight[i, j, k] += one
                             views[i, j, k] += 1.0
                             grey[i, j, k] += one * float(image[r, c])
-
-
-def cubes_of(parts: Sequence[set[tuple[int, int, int]]]) -> list[tuple[int, int, int]]:
-    """The cubes of all images, in order."""
-    return sorted(set().union(*parts))
 
 
 def voxel_places(index: tuple[int, int, int]) -> I64:

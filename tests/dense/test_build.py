@@ -21,7 +21,7 @@ from stereo_sfm.arrays import write_arrays
 from stereo_sfm.cli import main
 from stereo_sfm.dense import build as module
 from stereo_sfm.dense import inputs
-from stereo_sfm.dense.files import read_mesh, write_all, write_heights, write_mesh_ply
+from stereo_sfm.dense.files import Mesh, read_mesh, write_all, write_heights, write_mesh_ply
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, partner, shows_more, with_partners
 from stereo_sfm.dense.pictures import render_mesh
 from stereo_sfm.dense.report import write_report
@@ -79,15 +79,15 @@ class Case:
 
 def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(monkeypatch)
-    results, map_T_floor = module.build(case.given, tmp_path, VOXEL, 1)
-    numbers = write_all(results, tmp_path, VOXEL, map_T_floor)
+    volume = module.build(case.given, tmp_path, VOXEL, 1)
+    numbers = write_all(volume, tmp_path)
     made = case.made
-    assert made == len(results) > 1
+    assert made == len(volume.indices) > 1
     assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["000000.npz", "000002.npz"], "15 cm show no more"
     written = {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()}
 
     (tmp_path / "cubes" / sorted(p.name for p in (tmp_path / "cubes").iterdir())[0]).write_bytes(b"cut off")
-    write_all(*reversed_args(module.build(case.given, tmp_path, VOXEL, 1), tmp_path))
+    write_all(module.build(case.given, tmp_path, VOXEL, 1), tmp_path)
     assert case.made == made + 1, "only the damaged cube is made again"
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir() if p.is_file()} == written, "the same bits"
 
@@ -116,11 +116,11 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
 def test_slices_las_and_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(monkeypatch)
     bands = (*module.ROBOT, (0.2, 0.6), (5.0, 6.0))
-    results, map_T_floor = module.build(case.given, tmp_path, 0.08, 1, bands=bands)
+    volume = module.build(case.given, tmp_path, 0.08, 1)
     made = case.made
     module.build(case.given, tmp_path, 0.08, 1)
-    assert case.made == made, "other slices need no fusion"
-    numbers = write_all(results, tmp_path, 0.08, map_T_floor, bands)
+    assert case.made == made, "what is there needs no fusion"
+    numbers = write_all(volume, tmp_path, bands)
     names = "costmap.png", "costmap_0.20_0.60.png", "costmap_5.00_6.00.png"
     whole, low, high = (cv2.imread(str(tmp_path / name), 0) for name in names)
     assert whole is not None and low is not None and high is not None
@@ -151,10 +151,13 @@ def test_a_mesh_is_drawn_from_before_and_the_nearer_face_hides_the_other() -> No
     points = np.concatenate([square, square + np.array([0, 0, 0.5])])
     colours = np.repeat(np.array([[250, 0, 0], [0, 0, 250]], np.uint8), 4, axis=0)
     up = np.array([[0, 2, 1], [0, 3, 2]])
-    image = render_mesh(points, colours, np.concatenate([up, up + 4]), 200)
+    image = render_mesh([points], [(points, colours, up), (points, colours, up + 4)], 200)
+    assert image is not None
     blue, red = image[..., 0] > image[..., 2] + 50, image[..., 2] > image[..., 0] + 50
     assert red.sum() > 1.1 * blue.sum() > 0, "the upper one hides a part of the lower one"
-    assert (render_mesh(points, colours, up[:, ::-1], 200) == 255).all(), "from behind there is nothing"
+    behind = render_mesh([points], [(points, colours, up[:, ::-1])], 200)
+    assert behind is not None and (behind == 255).all(), "from behind there is nothing"
+    assert render_mesh([points], [], 200) is None
 
 
 def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
@@ -164,7 +167,9 @@ def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
     plan = FloorPlan(np.zeros((20, 30), np.uint8), 0.1, (-1.0, -0.5), np.eye(4))
     pictures: list[Any] = []
     for points in (below, np.concatenate([below, ceiling])):
-        write_heights(tmp_path / "height.png", points, plan)
+        with Mesh(tmp_path) as mesh:
+            mesh.add(points, np.zeros(len(points), np.uint8), np.zeros((0, 3), np.int64))
+            write_heights(tmp_path / "height.png", mesh, plan)
         pictures.append(cv2.imread(str(tmp_path / "height.png"), cv2.IMREAD_UNCHANGED))
     np.testing.assert_array_equal(pictures[0], pictures[1])
     assert pictures[0].shape == (20, 30, 4), "the pixels of the costmap"
@@ -177,9 +182,11 @@ def test_a_ceiling_does_not_hide_what_is_below(tmp_path: Path) -> None:
 def test_a_mesh_is_read_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "mesh.ply"
     points, triangles = np.arange(12.0).reshape(4, 3), np.array([[0, 1, 2], [3, 2, 1]])
-    colours = np.arange(12, dtype=np.uint8).reshape(4, 3)
-    write_mesh_ply(path, points, colours, triangles)
-    for read, wrote in zip(read_mesh(path), (points, colours, triangles), strict=True):
+    grey = np.arange(4, dtype=np.uint8)
+    with Mesh(tmp_path) as mesh:
+        mesh.add(points, grey, triangles)
+        write_mesh_ply(path, mesh)
+    for read, wrote in zip(read_mesh(path), (points, np.repeat(grey[:, None], 3, axis=1), triangles), strict=True):
         np.testing.assert_array_equal(read, wrote)
     whole = path.read_bytes()
     for bad in (b"", b"ply\n", whole[:-1], whole + b"x", whole.replace(b"face 2", b"face 3"), whole[:-4] + b"\xff" * 4):
@@ -194,15 +201,10 @@ def test_two_processes_write_the_same_bits(tmp_path: Path, monkeypatch: pytest.M
     case.frames = case.frames[::2]
     for jobs in (1, 2):
         folder = tmp_path / str(jobs)
-        results, map_T_floor = module.build(case.given, folder, 0.08, jobs)
-        write_all(results, folder, 0.08, map_T_floor)
+        write_all(module.build(case.given, folder, 0.08, jobs), folder)
     one, two = ({p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*.*")} for n in "12")
     assert len(one) > 8
     assert one == two
-
-
-def reversed_args(built: Any, folder: Path) -> tuple[Any, ...]:
-    return built[0], folder, VOXEL, built[1]
 
 
 def test_one_camera_has_depth_from_motion_alone() -> None:

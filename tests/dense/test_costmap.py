@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import yaml
 
-from stereo_sfm.dense.build import CubeResult
-from stereo_sfm.dense.files import costmap
-from stereo_sfm.dense.surface import Surface
+from stereo_sfm.dense.build import ROBOT
+from stereo_sfm.dense.files import costmaps
 from stereo_sfm.dense.volume import SIDE
 from stereo_sfm.export.floor_plan import write_floor_plan
 from stereo_sfm.types import Bool
@@ -19,10 +20,8 @@ VOXEL = 0.05
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1  # of nav_msgs/OccupancyGrid
 
 
-def cube(index: tuple[int, int, int], occupied: Bool, free: Bool) -> CubeResult:
-    none = np.zeros(0, np.int64)
-    empty = Surface(none, np.zeros((0, 3), np.float32), np.zeros(0, np.uint8), none.reshape(0, 4))
-    return CubeResult(index, empty, occupied[None], free[None])
+def cube(index: tuple[int, int, int], occupied: Bool, free: Bool) -> tuple[tuple[int, int, int], Bool, Bool]:
+    return index, occupied[None], free[None]
 
 
 class MapServer:
@@ -58,7 +57,10 @@ def test_map_server_reads_each_place_as_it_was_seen(tmp_path: Path) -> None:
         cube((0, 0, 1), none, floor | shelf),  # seen through above the shelf: the shelf stays
         cube((-1, -1, 0), pillar, none),
     ]
-    write_floor_plan(costmap(results, VOXEL, np.eye(4)), tmp_path / "costmap_0.10_0.60")
+    volume: Any = SimpleNamespace(
+        indices=[r[0] for r in results], voxel=VOXEL, map_T_floor=np.eye(4), columns=lambda _: iter(results)
+    )
+    write_floor_plan(costmaps(volume, ROBOT)[0], tmp_path / "costmap_0.10_0.60")
     server = MapServer(tmp_path / "costmap_0.10_0.60.yaml")
     half = 0.5 * VOXEL
     for x in (0.0, 1.0, 3.15):

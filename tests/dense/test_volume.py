@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
+import tracemalloc
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pytest
+
+from stereo_sfm.arrays import write_arrays
+from stereo_sfm.dense import files
+from stereo_sfm.dense.build import Volume
 from stereo_sfm.dense.depth import DepthImage
+from stereo_sfm.dense.files import joined, read_mesh, write_cloud_ply, write_glb, write_las, write_mesh_ply
 from stereo_sfm.dense.keyframe_depth import joined as joined_depth
-from stereo_sfm.dense.surface import extract, joined
-from stereo_sfm.dense.volume import Seen, contributes, cubes_of, fuse, touched
+from stereo_sfm.dense.surface import Numbering, extract
+from stereo_sfm.dense.volume import SIDE, Cube, Seen, contributes, fuse, touched
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.types import F64
 
@@ -26,9 +35,17 @@ def wall(z: float, session: int = 0, place: F64 | None = None, sigma: float = 0.
 
 
 def mesh(images: list[Seen]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    cubes = cubes_of([touched(s, VOXEL) for s in images])
-    kept = [[s for s in images if contributes(s.floor_T_cam[:3, 3], s.reach(VOXEL), c, VOXEL)] for c in cubes]
-    return joined([extract(fuse(c, k, VOXEL)) for c, k in zip(cubes, kept, strict=True)])
+    """Vertices in voxels, grey levels and triangles of all cubes."""
+    places, reach = np.stack([s.floor_T_cam[:3, 3] for s in images]), np.array([s.reach(VOXEL) for s in images])
+    numbering, parts = Numbering(), list[tuple[Any, ...]]()
+    for cube in sorted(set[Any]().union(*(touched(s, VOXEL) for s in images))):
+        seen_by = np.flatnonzero(contributes(places, reach, cube, VOXEL))
+        surface = extract(fuse(cube, [images[i] for i in seen_by], VOXEL))
+        if len(surface.quads):
+            new, numbers = numbering.add(surface)
+            parts.append((surface.vertices[new], surface.grey[new], numbers[surface.triangles()]))
+    vertices, grey, triangles = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return vertices, grey, triangles
 
 
 def test_a_wall_is_one_closed_surface_at_its_place() -> None:
@@ -42,6 +59,32 @@ def test_a_wall_is_one_closed_surface_at_its_place() -> None:
     assert (count == 2).mean() > 0.9, "cubes are not joined"
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     assert (np.cross(b - a, c - a)[:, 2] < 0).all(), "faces look at the camera"
+
+
+@pytest.mark.parametrize("cubes", [4, 40])
+def test_memory_does_not_depend_on_the_number_of_cubes(
+    cubes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A floor across a row of cubes is one mesh, with a cube and a chunk in memory at a time."""
+    monkeypatch.setattr(files, "CHUNK", 1000)
+    place, n = tmp_path / "cubes", SIDE + 2
+    place.mkdir()
+    distance = np.broadcast_to(np.arange(n, dtype=np.float32) - 30.4, (n, n, n)).copy()
+    seen, grey = np.full((n, n, n), 2, np.float32), np.full((n, n, n), 77, np.float32)
+    volume = Volume(place, [(k, 0, 0) for k in range(cubes)], VOXEL, np.eye(4))
+    for index in volume.indices:
+        columns = vars(extract(Cube(index, distance, seen, seen, grey)))
+        write_arrays(place / f"{index[0]}_0_0.npz", columns)
+    tracemalloc.start()
+    with joined(volume, tmp_path) as mesh:
+        for write in (write_mesh_ply, write_glb, write_cloud_ply, write_las):
+            write(tmp_path / write.__name__, mesh)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    points, _, triangles = read_mesh(tmp_path / "write_mesh_ply")
+    assert len(np.unique(points, axis=0)) == len(points) == (cubes * SIDE + 1) * (SIDE + 1), "borders are shared"
+    assert len(triangles) == 2 * cubes * SIDE**2
+    assert peak < 3 << 20, "the whole floor of 40 cubes has 15 MB"
 
 
 def test_a_person_who_was_seen_twice_is_gone_when_others_see_through() -> None:

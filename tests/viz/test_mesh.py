@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
-from stereo_sfm.dense.files import write_mesh_ply
+from stereo_sfm.dense.files import Mesh, write_mesh_ply
 from stereo_sfm.viz.surface import TABS, show_surface, vertex_normals
 from tests.viz.test_sink import Recording
 
@@ -30,6 +30,8 @@ def test_the_command_takes_the_folder(tmp_path: Path, capsys: pytest.CaptureFixt
     out = tmp_path / "mesh.rrd"
     assert main(["viz", str(tmp_path), "--save", str(out)]) != 0
     assert "no surface" in capsys.readouterr().err
-    write_mesh_ply(tmp_path / "mesh.ply", POINTS.astype(float), GREY, TRIANGLES.astype(np.int64))
+    with Mesh(tmp_path) as mesh:
+        mesh.add(POINTS.astype(float), GREY[:, 0], TRIANGLES.astype(np.int64))
+        write_mesh_ply(tmp_path / "mesh.ply", mesh)
     assert main(["viz", str(tmp_path), "--save", str(out)]) == 0
     assert out.stat().st_size > 1000
