@@ -68,9 +68,10 @@ def keyframes(given: DenseInput) -> Iterator[KeyframeImages]:
     """
     saved, s = given.saved, given.saved.snapshot
     rigs = saved.keyframe_rigs()
+    cameras = [saved.cameras[session] for session in saved.session_ids]
     own = load_rig(given.rig) if given.rig is not None else None
     for spec in given.recordings:
-        with open_recording(spec, list(dict.fromkeys(rigs)), own) as source:
+        with open_recording(spec, cameras, own) as source:
             session = session_of_recording(saved, source, spec)
             rows = {
                 (int(s.frame_ids[k]), int(s.stamp_ns[k])): k for k in range(len(saved)) if saved.sessions[k] == session

@@ -11,19 +11,19 @@ from stereo_sfm.drivers.rectified import rectified
 from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
-from stereo_sfm.maps.cameras import difference
+from stereo_sfm.maps.cameras import MapCamera, difference
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import U8, StereoImage
 
 Key = tuple[int, int]  # frame id, stamp in ns
 
 
-def open_recording(spec: str, map_rigs: Sequence[Rig], own_rig: Rig | None = None) -> Source:
+def open_recording(spec: str, cameras: Sequence[MapCamera], own_rig: Rig | None = None) -> Source:
     """A recording, not yet entered, as seen by a camera of the map: unchanged, or rectified as in the run.
 
     Args:
         spec: the recording.
-        map_rigs: the cameras of the map.
+        cameras: of the map; as it was calibrated, or as corrected.
         own_rig: calibration that replaces the recording's own.
 
     Raises:
@@ -35,10 +35,11 @@ def open_recording(spec: str, map_rigs: Sequence[Rig], own_rig: Rig | None = Non
             seen = rectified(source, how)
         except StereoSfmError:  # one camera, or two that cannot be rectified this way
             continue
-        if not all(difference(rig, seen.rig, corrected=True) for rig in map_rigs):
+        if not all(difference(rig, seen.rig, corrected=True) for c in cameras for rig in (c.calibrated, c.rig)):
             return seen
+    other = difference(cameras[-1].rig, source.rig)
     raise StereoSfmError(
-        f"the camera of {spec} is not the map's, rectified or not (it has {difference(map_rigs[-1], source.rig)}): give"
+        f"the camera of {spec} is not the map's, rectified or not (it has {other}): give"
         " the recording of this map, and the --rig of its run if any"
     )
 

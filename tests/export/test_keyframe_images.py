@@ -18,7 +18,7 @@ from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.keyframe_images import check_session, open_recording, session_of_recording, write_keyframe_images
 from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.saved_map import SavedMap, joined, save_map
-from stereo_sfm.types import StereoImage
+from stereo_sfm.types import RIG_TERMS, StereoImage
 from tests.maps.maps import small_map
 
 LATER_NS = 10**12
@@ -94,14 +94,24 @@ def test_an_ambiguous_recording_is_rejected(tmp_path: Path, saved: SavedMap) -> 
 @pytest.mark.parametrize(("how", "option"), [("none", "none"), ("pinhole", "pinhole"), ("epipolar", "wide")])
 def test_images_are_those_of_the_maps_camera(how: str, option: str) -> None:
     rig = rectified(open_source(SPEC), how).rig
-    source = open_recording(SPEC, [rig])
+    source = open_recording(SPEC, [MapCamera(rig)])
     assert isinstance(source, RectifiedSource) == (option != "none")
     assert np.array_equal(source.rig.left.params, rig.left.params)
 
 
 def test_images_of_another_camera_are_refused(saved: SavedMap) -> None:
     with pytest.raises(StereoSfmError, match=r"is not the map's.*left image 150x140 instead of 848x800"):
-        open_recording(SPEC, [saved.rig])
+        open_recording(SPEC, [MapCamera(saved.rig)])
+
+
+def test_a_camera_whose_right_lens_was_corrected_is_the_maps() -> None:
+    """Of a lens without distortion, decentering makes one with."""
+    spec = f"{SPEC}&camera=pinhole"
+    terms = np.zeros(RIG_TERMS)
+    terms[6] = np.deg2rad(0.5)
+    corrected = MapCamera(open_source(spec).rig, terms)
+    assert corrected.rig.right is not None and corrected.rig.right.model != corrected.rig.left.model
+    assert not isinstance(open_recording(spec, [corrected]), RectifiedSource)
 
 
 def test_export_of_a_rectified_run_writes_rectified_images(
