@@ -19,11 +19,11 @@ from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.descriptor_tracker import DescriptorTracker
 from stereo_sfm.papers.extraction import circle_mask
 from stereo_sfm.papers.feature_view import FeatureView
-from stereo_sfm.papers.local_points import row_of
 from stereo_sfm.papers.matching import epipolar_inliers
 from stereo_sfm.papers.motion_estimator import FramePair, Motion, estimator
 from stereo_sfm.papers.step_scale import StepScale
 from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.flow.map_points import rows_of
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.types import F64, I64, U8, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
 
@@ -202,6 +202,6 @@ def _stats(motion: Motion | None) -> dict[str, float]:
 
 def _moved(points: F64, ids: I64, update: MapUpdate, kf_T_map: F64) -> F64:
     """(N, 3) points of a keyframe with the map's positions where the update has them."""
-    row, out = row_of(update.point_ids, ids), points.copy()
-    out[row >= 0] = se3.transform(kf_T_map, update.points_map[row[row >= 0]])
+    out, (hit, rows) = points.copy(), rows_of(update.point_ids, ids)
+    out[hit] = se3.transform(kf_T_map, update.points_map[rows])
     return out

@@ -15,10 +15,10 @@ from stereo_sfm.geometry.two_view import epipolar_residuals, essential_from_moti
 from stereo_sfm.papers.extraction import Extractor, Features, feature_kind
 from stereo_sfm.papers.matching import epipolar_inliers, match_features
 from stereo_sfm.tracking.depth_image import points_from_depth
+from stereo_sfm.tracking.descriptors import RADIUS
 from stereo_sfm.types import F64, I32, I64, U8, Bool, Message, StereoImage
 
 MIN_DISPARITY_PX = 0.5  # below, the depth is treated as unknown
-MASK_MARGIN_PX = 15  # half of the patch that ORB describes: keypoints keep so far from what a mask covers
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +96,8 @@ class ViewMaker:
 
 
 def _kept(mask: Bool | None) -> U8 | None:
-    """A camera's mask as OpenCV's detectors want it: no keypoint whose surroundings touch what is not used."""
-    return None if mask is None else uncovered(mask, MASK_MARGIN_PX).astype(np.uint8)
+    """A camera's mask as OpenCV's detectors want it: no keypoint whose patch touches what is not used."""
+    return None if mask is None else uncovered(mask, RADIUS).astype(np.uint8)
 
 
 def _both(a: U8 | None, b: U8 | None) -> U8 | None:

@@ -11,6 +11,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.papers.extraction import Features
 from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.papers.point_ids import PointIds
+from stereo_sfm.tracking.flow.map_points import rows_of
 from stereo_sfm.types import F32, F64, I64, U8, MapUpdate
 
 
@@ -41,26 +42,15 @@ class LocalPoints:
         keep[first] = True
         keep &= ~np.isin(known, update.culled_point_ids)
         self.ids, self.points, self.descriptors = known[keep], self.points[keep].copy(), self.descriptors[keep]
-        row = row_of(update.point_ids, self.ids)
-        hit = row >= 0
-        self.points[hit] = se3.transform(se3.inverse(update.map_T_odom), update.points_map[row[hit]])
+        hit, rows = rows_of(update.point_ids, self.ids)
+        self.points[hit] = se3.transform(se3.inverse(update.map_T_odom), update.points_map[rows])
 
     def positions(self, ids: I64) -> F64:
         """(M, 3) of given ids in the odometry frame, NaN where unknown."""
-        row = row_of(self.ids, ids)
-        out = np.full((len(ids), 3), np.nan)
-        out[row >= 0] = self.points[row[row >= 0]]
+        out, (hit, rows) = np.full((len(ids), 3), np.nan), rows_of(self.ids, ids)
+        out[hit] = self.points[rows]
         return out
 
     def features(self, rows: I64) -> Features:
         """Some rows as features for matching; their pixels mean nothing."""
         return Features(np.zeros((len(rows), 2)), self.descriptors[rows])
-
-
-def row_of(ids: I64, wanted: I64) -> I64:
-    """(M,) row of each wanted id in `ids` (unique), -1 where it is not."""
-    if len(ids) == 0:
-        return np.full(len(wanted), -1, np.int64)
-    order = np.argsort(ids, kind="stable")
-    at = np.searchsorted(ids[order], wanted).clip(0, len(ids) - 1)
-    return np.where(ids[order[at]] == wanted, order[at], -1).astype(np.int64)

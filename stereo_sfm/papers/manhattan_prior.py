@@ -18,8 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.lines import LineDetector
 from stereo_sfm.geometry.procrustes import rotation_between
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.geometry.vanishing import Manhattan, nearest_turn
-from stereo_sfm.papers.manhattan import measure
+from stereo_sfm.geometry.vanishing import Manhattan, estimate, nearest_turn
 from stereo_sfm.tracking.protocol import AnyTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
@@ -109,7 +108,8 @@ class ManhattanTracker:
         good = frame.state in (TrackState.OK, TrackState.RECOVERED)
         if good and image.frame_id % self._config.every == 0:
             try:
-                found = measure(self._lines, image.left, image.frame_id, self._filter.expected(pose[:3, :3]))
+                expected, rng = self._filter.expected(pose[:3, :3]), np.random.default_rng(image.frame_id)
+                found = estimate(self._lines.detect(image.left), rng, expected=expected)
                 turned = self._filter.correct(pose[:3, :3], found)
                 pose = se3.orthonormalize(se3.from_rotation_translation(turned, pose[:3, 3]))
                 self._outer_T_inner = se3.orthonormalize(pose @ se3.inverse(frame.odom_T_cam))

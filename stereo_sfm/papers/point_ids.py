@@ -25,17 +25,11 @@ class PointIds:
 
     def current(self, ids: I64) -> I64:
         """The living id of each."""
-        if not self._replaced:
-            return ids
-        return np.array([self._follow(i) for i in ids.tolist()], np.int64)
-
-    def _follow(self, point: int) -> int:
-        for _ in range(len(self._replaced) + 1):
-            replaced = self._replaced.get(point)
-            if replaced is None:
-                return point
-            point = replaced
-        return point
+        out: list[int] = ids.tolist()
+        for k in range(len(out)):
+            while out[k] in self._replaced:
+                out[k] = self._replaced[out[k]]
+        return np.array(out, np.int64)
 
     def inherit(self, view: FeatureView, reference: FeatureView, rows: I64) -> FeatureView:
         """The view with ids of the reference for matched rows (M, 2) = (reference, view); an id is given only once."""

@@ -15,9 +15,10 @@ from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.two_view import essential_from_motion
 from stereo_sfm.papers.extraction import Features
 from stereo_sfm.papers.feature_view import FeatureView
-from stereo_sfm.papers.local_points import LocalPoints, row_of
+from stereo_sfm.papers.local_points import LocalPoints
 from stereo_sfm.papers.monocular_start import TwoViewStart, good_points, start_from
 from stereo_sfm.papers.point_ids import PointIds
+from stereo_sfm.tracking.flow.map_points import rows_of
 from stereo_sfm.types import F64, MapUpdate
 from tests.papers.synthetic_views import PIXEL, unit
 
@@ -162,5 +163,6 @@ def test_local_points_follow_the_map() -> None:
 
 
 def test_rows_of_ids() -> None:
-    assert row_of(np.array([7, 3, 5]), np.array([5, 4, 7])).tolist() == [2, -1, 0]
-    assert row_of(np.zeros(0, np.int64), np.array([1])).tolist() == [-1]
+    hit, rows = rows_of(np.array([7, 3, 5]), np.array([5, 4, 7]))
+    assert hit.tolist() == [True, False, True] and rows.tolist() == [2, 0]
+    assert not rows_of(np.zeros(0, np.int64), np.array([1]))[0].any()

@@ -14,8 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt
 from stereo_sfm.geometry.lines import LineDetector
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.geometry.vanishing import nearest_turn
-from stereo_sfm.papers.manhattan import measure
+from stereo_sfm.geometry.vanishing import estimate, nearest_turn
 from stereo_sfm.papers.motion_estimator import FramePair
 from stereo_sfm.papers.odometry.vp_r import VpR
 from stereo_sfm.types import F64, U8
@@ -32,7 +31,8 @@ def orientations(spec: str) -> tuple[list[F64], list[F64], list[F64]]:
         lines = LineDetector(source.rig.left)
         for image in source:
             row = int(np.searchsorted(source.ground_truth.stamp_ns, image.stamp_ns))
-            found = measure(lines, image.left, image.frame_id, measured[-1] if measured else None)
+            rng, expected = np.random.default_rng(image.frame_id), measured[-1] if measured else None
+            found = estimate(lines.detect(image.left), rng, expected=expected)
             measured.append(found.cam_R_axes)
             covariances.append(found.covariance)
             truth.append(source.ground_truth.poses[row, :3, :3].T)
@@ -72,7 +72,7 @@ def test_a_scene_without_structure_is_declined() -> None:
     camera = KannalaBrandt(424, 400, 142.0, 142.0, 212.0, 200.0, (-0.004, 0.038, -0.036, 0.006))
     image = picture_of_nothing(camera.size)
     with pytest.raises(Degenerate, match=r"weak_structure|too_few_lines"):
-        measure(LineDetector(camera), image, 0)
+        estimate(LineDetector(camera).detect(image), np.random.default_rng(0))
     pair = frame_pair(np.eye(4))
     blank = FramePair(**{**vars(pair), "image_last": image, "image_now": image})
     with pytest.raises(Degenerate, match=r"weak_structure|too_few_lines"):

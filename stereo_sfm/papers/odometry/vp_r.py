@@ -12,8 +12,7 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.lines import LineDetector
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.geometry.vanishing import Manhattan
-from stereo_sfm.papers.manhattan import measure
+from stereo_sfm.geometry.vanishing import Manhattan, estimate
 from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 from stereo_sfm.papers.odometry._translation import translation_for
 from stereo_sfm.types import U8
@@ -40,8 +39,10 @@ class VpR:
         return Motion(rotation, translation, inliers, stats=stats)
 
     def _orientation(self, frame_id: int, image: U8, near: Manhattan | None) -> Manhattan:
-        known = self._known.get(frame_id)
-        return known or measure(self._lines, image, frame_id, None if near is None else near.cam_R_axes)
+        if frame_id in self._known:
+            return self._known[frame_id]
+        expected, rng = None if near is None else near.cam_R_axes, np.random.default_rng(frame_id)
+        return estimate(self._lines.detect(image), rng, expected=expected)
 
 
 ESTIMATOR = EstimatorEntry("vanishing points, then 1-point translation (retail paper)", VpR, needs_depth=True)

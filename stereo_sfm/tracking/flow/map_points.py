@@ -17,7 +17,7 @@ def take_update(tracks: Tracks, update: MapUpdate, resumed_T_odom: F64) -> Track
     `resumed_T_odom`: (4, 4) moves these besides.
     """
     tracks = _without_culled(_fused(tracks, update.fused_point_ids), update.culled_point_ids)
-    rows, found = _rows_of(update.point_ids, tracks.point_ids)
+    rows, found = rows_of(update.point_ids, tracks.point_ids)
     if len(found):
         to_odom = resumed_T_odom @ se3.inverse(update.map_T_odom)
         _place(tracks, rows, se3.transform(to_odom, update.points_map[found]))
@@ -29,7 +29,7 @@ def _fused(tracks: Tracks, pairs: I64) -> Tracks:
     old, first = np.unique(pairs[:, 0], return_index=True)
     if not len(old):
         return tracks
-    rows, found = _rows_of(old, tracks.point_ids)
+    rows, found = rows_of(old, tracks.point_ids)
     tracks.point_ids[rows] = pairs[first[found], 1]
     _, once = np.unique(tracks.point_ids, return_index=True)
     return tracks.keep(np.isin(np.arange(len(tracks)), once))
@@ -39,7 +39,7 @@ def _without_culled(tracks: Tracks, culled: I64) -> Tracks:
     return tracks.keep(~np.isin(tracks.point_ids, culled)) if len(culled) else tracks
 
 
-def _rows_of(ids: I64, wanted: I64) -> tuple[Bool, I64]:
+def rows_of(ids: I64, wanted: I64) -> tuple[Bool, I64]:
     """Mask (N,) of the wanted ids that are in `ids`, and the rows of those."""
     if not len(ids) or not len(wanted):
         return np.zeros(len(wanted), bool), np.zeros(0, np.int64)
