@@ -65,7 +65,7 @@ RULES = (
     _rule(
         "consistent points",
         SOLVER,
-        'return best if consistent or not self.alert else _no_pose(len(tracks), "no_consensus")',
+        'return best if consistent or not self.alert else no_pose(len(tracks), "no_consensus")',
         "return best",
     ),
     _rule(
@@ -83,20 +83,14 @@ RULES = (
     _rule(
         "alert for a second",
         SOLVER,
-        "ALERT_S if moving else max(self._alert_s - seconds, 0.0)",
-        "ALERT_S if moving else 0.0",
+        "STATIC_S if moving else max(self._alert_s - seconds, 0.0)",
+        "STATIC_S if moving else 0.0",
     ),
     _rule(
-        "prior of long-static points",
+        "prior of long-static and near points",
         SOLVER,
-        "self._optimise(tracks, expected, surely_static, expected)",
-        "self._optimise(tracks, expected, surely_static)",
-    ),
-    _rule(
-        "prior of near points",
-        SOLVER,
-        "self._optimise(tracks, expected, near, expected)",
-        "self._optimise(tracks, expected, near)",
+        "self._optimise(tracks, expected, by, expected)",
+        "self._optimise(tracks, expected, by)",
     ),
     _rule("prior in the refit", SOLVER, "first.inlier & static, expected)", "first.inlier & static)"),
     _rule("start at rest", SOLVER, "if best.inliers < 0.5 * np.count_nonzero(static):", "if False:"),
@@ -118,8 +112,8 @@ RULES = (
     _rule(
         "groups among neighbours",
         MARKS,
-        "    if len(rows) >= MIN_GROUP:\n",
-        "    out[rows] = True\n    if False:\n",
+        "return _marked_neighbours(tracks, points, points) > NEIGHBOURS // 2",
+        "return points",
     ),
     _rule(
         "places of lost movers",
@@ -179,7 +173,7 @@ RULES = (
     _rule(
         "recall by distance from the prediction",
         RECOVERY,
-        "return MIN_RECALL + RECALL_PER_METRE * min(prediction.sigma_m, MAX_SIGMA_M) + off",
+        "return MIN_RECALL * (1.0 + off) + RECALL_PER_METRE * min(prediction.sigma_m, MAX_SIGMA_M)",
         "return MIN_RECALL",
     ),
     _rule(

@@ -34,7 +34,7 @@ def test_every_named_number_of_the_core_is_scaled_alone(ablate: ModuleType) -> N
     source = "A = 2.0  # px\nB, C = 3, (0.5, 4)\nNAME = 'x'\ndef f():\n    return A\n"
     found = {name: new for name, _, _, new in ablate.scaled(source, 0.5)}
     assert found == {"A": "A = 1.0", "B": "B, C = (2, (0.5, 4))", "C": "B, C = (3, (0.25, 2))"}
-    assert {v.name for v in ablate.constants([""], 2.0)} >= {"tracking/flow/consensus.py:ALERT_S x 2"}
+    assert {v.name for v in ablate.constants([""], 2.0)} >= {"tracking/flow/consensus.py:SURE_S x 2"}
 
 
 def test_constants_of_compiled_functions_are_known(ablate: ModuleType) -> None:

@@ -20,7 +20,7 @@ from stereo_sfm.loop.pose_kernels import Lens
 from stereo_sfm.loop.pose_kernels import add_normal_equations as add
 from stereo_sfm.types import F64, Bool
 
-CHI2_2DOF_95 = chi_squared(0.95, 2)  # sigmas^2, of a pixel beyond which a match disagrees
+CHI2_2DOF_95 = chi_squared(2, 0.95)  # sigmas^2, of a pixel beyond which a match disagrees
 # Threes of matches: at a share of 0.2 that are right, four threes are right. Of them those with the likeliest ranges,
 # whose poses are compared by all matches: the ranges of wrong ones differ from the measured ones.
 SAMPLES, SCORED = 500, 50

@@ -31,9 +31,7 @@ LONGEST_STEP = 32.0  # steps of Gauss-Newton that `BundleConfig.extend` tries at
 LEAST_SQUARES = 100.0  # squared scale of Cauchy's loss over twice the variance: the mean weight is one within a percent
 MEDIAN_CHI2 = 2.0 * float(np.log(2.0))  # sigmas^2, of two dimensions
 TO_SIGMA = 1.4826  # from the median of absolute values, of normally distributed ones: 1 / Phi^-1(3/4)
-CHI2_2DOF_99 = chi_squared(0.99, 2)  # sigmas^2, of a pixel: one of a hundred right ones is left out
-MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual: exact data have none, and a scale of zero
-MIN_DISPARITY_SIGMA = 1e-2  # sigmas, lower bound of the points' mean disparity errors
+MIN_RESIDUAL = 0.05  # sigmas, lower bound of a median residual: exact data have none, and a scale of zero
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
 
@@ -47,7 +45,7 @@ class BundleConfig:
     cauchy: float = 0.0  # median residuals, the scale of Cauchy's loss in all rounds but the first; 0: Huber's
     disparity_sigmas: float = 0.0  # mean error of a point's stereo matches beyond which they count less; 0: never
     joint_loss: bool = False  # one loss over both images of an observation instead of one each
-    outlier_chi2: float = CHI2_2DOF_99  # squared normalised residual in one image that makes an outlier
+    outlier_chi2: float = chi_squared(2)  # squared normalised residual in an image: one of 100 right ones is left out
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
     damping: float = 1e-4  # first damping, relative to the diagonal
     fixed_once: bool = False  # observations of fixed keyframes are linearised once a round, not after every step
@@ -378,7 +376,7 @@ def _disparity_weights(total: F64, information: F64, sigmas: float) -> F64:
         return weight
     mean = total[seen] / information[seen]
     mean = np.abs(mean - median(mean)) * np.sqrt(information[seen])
-    limit = sigmas * max(TO_SIGMA * median(mean), MIN_DISPARITY_SIGMA)
+    limit = sigmas * max(TO_SIGMA * median(mean), MIN_RESIDUAL)
     weight[seen] = (limit / np.maximum(mean, limit)) ** 4
     return weight
 

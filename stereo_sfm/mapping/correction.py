@@ -29,7 +29,7 @@ COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose
 # Standard deviation of an odometry edge, metres and radians per metre, of good tracking; and its systematic part.
 ODOMETRY = 0.004, 0.0006
 MAX_STRAIN = 6.0  # sigmas^2 that a loop may keep: chi-squared of six degrees of freedom has this mean
-MAX_NOISE = chi_squared(0.95, 6)  # sigmas^2: noise exceeds that in one of twenty loops
+MAX_NOISE = chi_squared(6, 0.95)  # sigmas^2: noise exceeds that in one of twenty loops
 DRIFT = 0.003, 0.0003  # of scale and heading: metres and radians per metre of the path
 LOOP_SIGMAS = 0.01, 0.003  # metres, radians, smallest standard deviation of a loop: its points are not independent
 

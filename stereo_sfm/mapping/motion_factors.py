@@ -24,8 +24,6 @@ from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool, MotionLink
 
-# Sigmas^2 beyond which a motion counts less: 1 % of right ones.
-INERTIAL_CHI2, POSE_CHI2 = chi_squared(0.99, 9), chi_squared(0.99, 6)
 FIRST_ROUND = 10.0  # times as much is allowed before the poses are adjusted: until then it is they that may be wrong
 SPEED_SIGMA = 10.0  # m/s, where the tracker does not know the velocity: more than any robot's, as if nothing were known
 STATE = 9  # numbers: velocity in the map, biases of accelerometer and gyroscope
@@ -75,9 +73,9 @@ class MotionFactors:
         moving = np.flatnonzero(free >= 0)
         model = MotionModel(rot[moving].copy(), pos[moving].copy(), np.zeros((6 * size,) * 2), np.zeros(6 * size))
         if self.poses is not None:
-            _add_poses(self.poses, node_rot, node_pos, column, slack * POSE_CHI2, model)
+            _add_poses(self.poses, node_rot, node_pos, column, slack, model)
         if self.inertial is not None:
-            model.states = _add_inertial(self.inertial, node_rot, node_pos, column, slack * INERTIAL_CHI2, model)
+            model.states = _add_inertial(self.inertial, node_rot, node_pos, column, slack, model)
         return model
 
 
@@ -172,9 +170,13 @@ def _times(matrices: F64, vectors: F64) -> F64:
     return np.einsum("lrc,lc->lr", matrices, vectors)
 
 
-def _relative_weights(chi2: F64, limit: float) -> F64:
-    """(L,) factors of the information of motions with a chi-squared (L,)."""
-    return np.minimum(1.0, limit / np.maximum(chi2, limit))
+def _relative_weights(residual: F64, slack: float) -> F64:
+    """(L,) factors of the information of motions with whitened residuals (L, R): less than 1 for 1 % of right ones.
+
+    `slack`: times as much is allowed.
+    """
+    limit = slack * chi_squared(residual.shape[1])
+    return np.minimum(1.0, limit / np.maximum((residual**2).sum(axis=1), limit))
 
 
 def _normal_equations(jacobian: F64, residual: F64, columns: I64, size: int) -> tuple[F64, F64]:
@@ -193,7 +195,7 @@ def _pose_columns(column: I64) -> I64:
     return np.where(column[..., None] < 0, -1, 6 * column[..., None] + np.arange(6))
 
 
-def _add_poses(factors: PoseFactors, rot: F64, pos: F64, column: I64, limit: float, model: MotionModel) -> None:
+def _add_poses(factors: PoseFactors, rot: F64, pos: F64, column: I64, slack: float, model: MotionModel) -> None:
     i, j = factors.links.T
     poses = se3.from_rotation_translation(rot, pos)
     seen = se3.inverse(poses[i]) @ poses[j]
@@ -203,7 +205,7 @@ def _add_poses(factors: PoseFactors, rot: F64, pos: F64, column: I64, limit: flo
     jacobian = np.zeros((len(i), 6, 12))
     jacobian[:, :, :6], jacobian[:, :, 6:] = -se3.adjoint(se3.inverse(seen)), np.eye(6)
     jacobian, residual = root @ jacobian, _times(root, residual)
-    weight = np.sqrt(_relative_weights((residual**2).sum(axis=1), limit))
+    weight = np.sqrt(_relative_weights(residual, slack))
     jacobian, residual = weight[:, None, None] * jacobian, weight[:, None] * residual
     columns = _pose_columns(column[factors.links]).reshape(len(i), 12)
     h, g = _normal_equations(jacobian, residual, columns, len(model.g))
@@ -246,7 +248,7 @@ class _System:
 
 
 def _add_inertial(
-    factors: InertialFactors, rot: F64, pos: F64, column: I64, limit: float, model: MotionModel
+    factors: InertialFactors, rot: F64, pos: F64, column: I64, slack: float, model: MotionModel
 ) -> States:
     left_T_imu, size, nodes = factors.imu.left_T_imu, len(model.g), len(column)
     rot, pos = rot @ left_T_imu[:3, :3], pos + rot @ left_T_imu[:3, 3]  # of the IMU
@@ -272,7 +274,7 @@ def _add_inertial(
     eliminated = system.eliminated()
     step = np.concatenate([np.zeros(size), -eliminated[:, 0], [0.0]])
     left = residual + _times(jacobian, step[columns])
-    weight = _relative_weights((left[:, :STATE] ** 2).sum(axis=1), limit)
+    weight = _relative_weights(left[:, :STATE], slack)
     if (weight < 1.0).any():
         scale = np.sqrt(weight)[:, None]
         jacobian[:, :STATE], residual[:, :STATE] = scale[:, :, None] * jacobian[:, :STATE], scale * residual[:, :STATE]

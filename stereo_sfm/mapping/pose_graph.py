@@ -20,7 +20,6 @@ from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.types import F64, I64, Bool
 
 ROBUST = ("gnc", "switchable", "none")
-CHI2_6DOF_99 = chi_squared(0.99, 6)  # sigmas^2, of a loop from which its weight falls below one
 HELD = 1e-6  # metres, radians: standard deviation of a pose that stays, far below that of any edge
 TILT = 0.05  # radians, that of its roll and pitch where gravity is known: far above gravity's
 
@@ -116,7 +115,7 @@ def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool, grav
         metres, radians = edges.sigmas[e]
         noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
         if edges.loop[e] and robust:
-            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(CHI2_6DOF_99), noise)
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(chi_squared(6)), noise)
         graph.add(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), gtsam.Pose3(measured[e]), noise))
     held = _held(fixed, values, gravity)
     for row in fixed.tolist():
@@ -160,4 +159,4 @@ def _graduated(gtsam: Any, graph: Any, values: Any, edges: Edges) -> tuple[Any, 
 
 def _switch(chi2: float) -> float:
     """Weight that dynamic covariance scaling gives to a squared error."""
-    return min(1.0, 2 * CHI2_6DOF_99 / (CHI2_6DOF_99 + chi2)) ** 2
+    return min(1.0, 2 * chi_squared(6) / (chi_squared(6) + chi2)) ** 2

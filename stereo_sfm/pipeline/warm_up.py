@@ -20,7 +20,7 @@ from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
-from stereo_sfm.tracking.flow.frame_pose import FramePoseSolver, PoseSolution
+from stereo_sfm.tracking.flow.frame_pose import FramePoseSolver, no_pose
 from stereo_sfm.tracking.flow.klt import build_pyramid
 from stereo_sfm.tracking.flow.reappearance import find_deformed
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
@@ -115,7 +115,7 @@ def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
     uv, warps, patches = np.zeros((1, 2)), np.tile(np.eye(2), (1, 1, 1, 1)), np.zeros((1, FLAT_SIZE), np.float32)
     find_deformed(pyramid[1], uv, warps, np.zeros(1, np.int64), patches, 1, 1, uv.copy(), warps[0].copy())
     solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), RollingShutter(rig))
-    solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), config.tracker.sigma_px, 1.0)
+    solution = no_pose(0, "")
     solver.shift_chi2(Tracks(), solution)
     solver.influence(Tracks(), solution)
     if rig.imu is not None and config.tracker.inertial:

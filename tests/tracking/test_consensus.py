@@ -22,7 +22,6 @@ SECONDS = 1 / 15
 STATIC = static_frames(SECONDS)
 MOVED = se3.exp(np.array([0.0, 0.0, 0.055, 0.0, 0.002, 0.0]))  # of the camera since the last frame
 STILL, MOVING = 60, 150
-NONE = np.zeros(0, bool)
 
 
 def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
@@ -172,7 +171,7 @@ def test_new_points_on_somebody_who_sways_do_not_take_the_pose_along(monkeypatch
         solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
         expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
         solution = solver.solve(tracks, expected, np.eye(4), before=len(tracks))
-        assert not len(solution.moving) or not solution.moving[~on_person].any()
+        assert not solution.moving[~on_person].any()
         with monkeypatch.context() as patch:
             patch.setattr(solver, "_contradicted", lambda *_: None)
             errors.append((off(solution.pose), off(solver.solve(tracks, expected, np.eye(4), before=len(tracks)).pose)))
@@ -322,7 +321,7 @@ def test_an_unusual_motion_that_the_map_confirms_is_better_than_no_pose(mapped: 
     assert solver._confirmed(best, store.mapped, 30) == mapped  # pyright: ignore[reportPrivateUsage]
     if mapped:
         solution = solver.solve(store, jump, np.eye(4), before=len(store))
-        assert off(solution.pose) < 0.005 and not len(solution.moving) and solution.inlier.mean() > 0.9
+        assert off(solution.pose) < 0.005 and not solution.moving.any() and solution.inlier.mean() > 0.9
 
 
 def test_points_that_a_map_update_moves_together_are_not_lost() -> None:
@@ -343,7 +342,7 @@ def test_points_that_a_map_update_moves_together_are_not_lost() -> None:
 def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):
-        tracks, kept = after_frame(tracks, ~on_person, NONE, 3, alert=True, static=STATIC)
+        tracks, kept = after_frame(tracks, ~on_person, np.zeros(len(tracks), bool), 3, alert=True, static=STATIC)
         assert kept[~on_person].all()
         on_person = on_person[kept]
     assert on_person.sum() > 0.8 * MOVING
@@ -357,7 +356,9 @@ def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     assert (Movers().near(tracks.uv, tracks.rho, tracks, 1)[marked] > 0).all()
     assert not Movers().near(tracks.uv, tracks.rho, tracks, 7).any()  # of six neighbours
     for _ in range(STATIC):
-        tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), NONE, 3, alert=True, static=STATIC)
+        tracks, _ = after_frame(
+            tracks, np.ones(len(tracks), bool), np.zeros(len(tracks), bool), 3, alert=True, static=STATIC
+        )
     assert not tracks.moving.any()
 
 
@@ -367,7 +368,7 @@ def test_marks_fade_where_points_mostly_agree() -> None:
     tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
     for frame in range(4 * STATIC):
         agrees = np.full(len(tracks), frame % 5 != 0) | ~tracks.moving
-        tracks, _ = after_frame(tracks, agrees, NONE, 3, alert=True, static=STATIC)
+        tracks, _ = after_frame(tracks, agrees, np.zeros(len(tracks), bool), 3, alert=True, static=STATIC)
         begun = Movers().near(tracks.uv, tracks.rho, tracks)
         assert begun.max(initial=0) <= tracks.misses.max()
     assert not tracks.moving.any() and not begun.any()
@@ -378,14 +379,16 @@ def test_a_mark_stays_where_points_mostly_disagree() -> None:
     tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
     for frame in range(4 * STATIC):
         agrees = np.full(len(tracks), frame % 2 == 0) | ~on_person
-        tracks, _ = after_frame(tracks, agrees, NONE, 3, alert=True, static=STATIC)
+        tracks, _ = after_frame(tracks, agrees, np.zeros(len(tracks), bool), 3, alert=True, static=STATIC)
     assert (tracks.moving == on_person).all()
 
 
 def test_no_point_is_marked_in_a_static_scene() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):
-        tracks, _ = after_frame(tracks, ~on_person[: len(tracks)], NONE, 3, alert=False, static=STATIC)
+        tracks, _ = after_frame(
+            tracks, ~on_person[: len(tracks)], np.zeros(len(tracks), bool), 3, alert=False, static=STATIC
+        )
     assert len(tracks) == STILL
     assert not tracks.moving.any()
 
@@ -416,7 +419,7 @@ def test_points_that_were_only_suspect_do_not_make_others_suspect() -> None:
     assert not movers.near(tracks.uv, tracks.rho, tracks).any()
     movers.update(tracks, tracks.keep(~on_person), RIG.left, MOVED)
     assert not movers.near(tracks.uv[on_person], tracks.rho[on_person], tracks.keep(~on_person)).any()
-    tracks, _ = after_frame(tracks, ~on_person, NONE, 3, alert=True, static=STATIC)
+    tracks, _ = after_frame(tracks, ~on_person, np.zeros(len(tracks), bool), 3, alert=True, static=STATIC)
     assert (movers.near(tracks.uv, tracks.rho, tracks) > 0)[on_person].mean() > 0.9
 
 
@@ -441,7 +444,7 @@ def test_an_alert_lasts_while_a_group_disagrees() -> None:
     expected = ExpectedMotion(MOVED, np.zeros(6), SECONDS)
     disagree = solver.solve(tracks, expected, np.eye(4), before=400)
     solver.learn(tracks, disagree, expected)
-    disagree.moving = NONE
+    disagree.moving = np.zeros(len(tracks), bool)
     for _ in range(30):
         solver.learn(tracks, disagree, expected)
     assert solver.alert

@@ -186,7 +186,7 @@ def test_less_certain_poses_need_more_of_the_view(recall: float, seconds: float,
     recovery.motion.add(-100_000_000, np.eye(4))
     recovery.motion.add(0, np.eye(4))
     expected = recovery.motion.expect(round(seconds * 1e9))
-    solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0)
+    solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0, np.zeros(100, bool))
     assert recovery.possible(expected, solution, recall) == accepted
 
 
@@ -199,7 +199,7 @@ def test_where_a_steady_motion_ends_less_of_the_view_is_enough(metres: float, ac
     stamp = 2_000_000_000
     expected, steady = recovery.motion.expect(stamp), recovery.motion.steady(stamp)
     there = se3.exp(np.array([0.0, 0.0, 1.6 + metres, 0.0, 0.0, 0.0]))
-    solution = PoseSolution(there, np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0)
+    solution = PoseSolution(there, np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0, np.zeros(100, bool))
     assert recovery.possible(expected, solution, 0.5, steady) == accepted
     assert not recovery.possible(expected, solution, 0.5)
 

@@ -21,14 +21,16 @@ from stereo_sfm.types import F64, I32, I64, Bool, Corners
 
 MIN_GROUP = 8  # points of a group; fewer do not define a motion
 AGREEING_SHARE = 0.65  # of the points that were tracked; if fewer agree, another motion is searched for
+# Of the points that are followed, and of those that agree in an open view: with so many a pose is beyond doubt.
+TRUSTED_SHARE, TRUSTED_OPEN = 0.8, 0.3
 SURE_S = 0.3  # a point that was tracked for so long has its full weight ...
 MIN_WEIGHT = 0.1  # ... and a new one this
 MIN_OPEN_SHARE = 0.2  # of the inliers in an unobstructed view; with fewer the camera counts as covered
 WEIGHT_RATIO = 1.05  # by which another motion must outweigh the one that all points give
-ALERT_S = 1.0  # for which other motions are searched for after one was seen
-MOVING_NEIGHBOURS, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
+NEIGHBOURS = 6  # nearest ones of a point, which moves if half of them disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
-STATIC_S, MIN_STATIC_FRAMES = 1.0, 4  # for which a moving point must agree before it is used
+# For which a moving point must agree before it is used, and other motions are searched for after one was seen.
+STATIC_S, MIN_STATIC_FRAMES = 1.0, 4
 DISAGREES = 2  # frames of agreement that one of disagreement outweighs
 
 
@@ -43,7 +45,7 @@ def after_frame(
     """Tracks with updated `misses` and `moving`: points that disagree for long are dropped, groups of them marked.
 
     Args:
-        inlier: (N,) which points agree with the pose. moving: (N,) which support another motion; (0,): none.
+        inlier: (N,) which points agree with the pose. moving: (N,) which support another motion.
         misses_allowed: successive frames of disagreement.
         alert: whether an object may be moving; if not, nothing is marked.
         static: frames in which a moving point must agree before it is used again.
@@ -56,13 +58,8 @@ def after_frame(
     tracks.misses = np.where(tracks.moving, remaining, misses).astype(np.int32)
     out = ~tracks.moving & (tracks.misses >= misses_allowed)
     disagree = tracks.moving | (tracks.misses > 0)
-    group = np.zeros(len(tracks), bool)
-    rows = np.flatnonzero(out) if alert else np.zeros(0, np.int64)
-    group[rows] = (
-        _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, disagree) > MOVING_NEIGHBOURS
-    )
-    if len(moving):
-        group |= moving & ~tracks.moving
+    group = out & alert & (_marked_neighbours(tracks, out & alert, disagree) > NEIGHBOURS // 2)
+    group |= moving & ~tracks.moving
     tracks.misses[group] = static
     tracks.disagreed = (tracks.disagreed | (tracks.moving & ~inlier) | group) & (tracks.misses > 0)
     tracks.moving = (tracks.moving | group) & (tracks.misses > 0)
@@ -105,7 +102,7 @@ class Movers:
         self._places, self._frames, self._uv = places[kept], frames[kept].astype(np.int32), uv[kept]
         self._rho = 1.0 / np.linalg.norm(in_camera[kept], axis=1)
 
-    def near(self, uv: F64, rho: F64, tracks: Tracks, least: int = MOVING_NEIGHBOURS) -> I32:
+    def near(self, uv: F64, rho: F64, tracks: Tracks, least: int = NEIGHBOURS // 2) -> I32:
         """(M,) frames in which new points, (M, 2) px and (M,) 1/m, must agree before they are used.
 
         0 where fewer than `least` of their nearest neighbours move, or lost their points while they came nearer; else
@@ -123,12 +120,13 @@ class Movers:
         return np.where(count >= least, np.ceil(mean), 0).astype(np.int32)
 
 
-def _marked_neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
-    """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance."""
-    if not len(uv) or not marked.any():
-        return np.zeros(len(uv))
-    near, alike = _neighbours(uv, rho, among_uv, among_rho, len(among_uv))
-    return (marked[near] & alike).sum(1)
+def _marked_neighbours(tracks: Tracks, points: Bool, marked: Bool) -> I64:
+    """(N,) how many of the nearest NEIGHBOURS of `points` (N,) are marked (N,) and at about the same distance."""
+    out, rows = np.zeros(len(tracks), np.int64), np.flatnonzero(points)
+    if len(rows) and marked.any():
+        near, alike = _neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, len(tracks))
+        out[rows] = (marked[near] & alike).sum(1)
+    return out
 
 
 def _neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, tracked: int) -> tuple[I64, Bool]:
@@ -144,22 +142,14 @@ def _neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, tracked: int) 
 
 def in_group(tracks: Tracks, points: Bool) -> Bool:
     """(N,) which of the `points` (N,) have neighbours among them at their own distance."""
-    rows, out = np.flatnonzero(points), np.zeros(len(points), bool)
-    if len(rows) >= MIN_GROUP:
-        out[rows] = (
-            _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, points) > MOVING_NEIGHBOURS
-        )
-    return out
+    if np.count_nonzero(points) < MIN_GROUP:
+        return np.zeros(len(points), bool)
+    return _marked_neighbours(tracks, points, points) > NEIGHBOURS // 2
 
 
 def beside_moving(tracks: Tracks) -> Bool:
     """(N,) which static points have a moving one among their nearest neighbours, at about their distance."""
-    out = np.zeros(len(tracks), bool)
-    if not tracks.moving.any():
-        return out
-    rows = np.flatnonzero(~tracks.moving)
-    out[rows] = _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, tracks.moving) > 0
-    return out
+    return _marked_neighbours(tracks, ~tracks.moving, tracks.moving) > 0
 
 
 def without_moving(corners: Corners, tracks: Tracks, movers: Movers) -> Corners:

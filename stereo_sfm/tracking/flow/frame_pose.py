@@ -5,22 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.flow import pose_solver
 from stereo_sfm.tracking.flow.consensus import (
     AGREEING_SHARE,
-    ALERT_S,
     MIN_GROUP,
     MIN_OPEN_SHARE,
     MIN_WEIGHT,
     STATIC_S,
     SURE_S,
+    TRUSTED_OPEN,
+    TRUSTED_SHARE,
     WEIGHT_RATIO,
     beside_moving,
     in_group,
@@ -45,14 +47,11 @@ MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
 USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
 UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
-# A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
-# are static and of an unobstructed view, are believed whatever the motion.
-CONSISTENT_SHARE, CONSISTENT_OPEN = 0.8, 0.3
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
 # the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they move it
 # away: by 14 at most in 700 images of stores without people and of EuRoC. If by more than has 1 % of six degrees of
 # freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
-NEARER, SHIFT_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
+NEARER, WRONG_SIGMAS = 1.25, 2.0
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
@@ -93,11 +92,9 @@ class PoseSolution:
     error: F64  # (N,) whitened
     sigma_px: float  # noise by which it is whitened
     max_error: float
+    moving: Bool  # (N,) points that support another motion
     reason: str = ""  # why there is no pose
     blurred: bool = False  # whether the image is blurred, so that its points are good for a pose only
-    moving: Bool = field(
-        default_factory=lambda: np.zeros(0, bool)
-    )  # (N,) points that support another motion; (0,): none
 
     @property
     def inlier(self) -> Bool:
@@ -149,7 +146,7 @@ class FramePoseSolver:
     def solve_again(self, tracks: Tracks, expected: ExpectedMotion) -> PoseSolution:
         """Solve for the pose of a lost camera from points that were static before, starting at the expected pose."""
         if len(tracks) < self._config.min_features:
-            return _no_pose(len(tracks), "too_few_points")
+            return no_pose(len(tracks), "too_few_points")
         with self._noise_of_at_least(REAPPEARED_NOISE):
             return self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
 
@@ -166,7 +163,7 @@ class FramePoseSolver:
                 return replace(self.solve(tracks, expected, last_pose, before), blurred=True)
         static = ~tracks.moving
         if np.count_nonzero(static) < self._config.min_features:
-            return _no_pose(len(tracks), "too_few_points")
+            return no_pose(len(tracks), "too_few_points")
         best = self._solve_all(tracks, expected, last_pose, static)
         contradicted = self._contradicted(tracks, expected, best)
         if contradicted is None:
@@ -174,7 +171,7 @@ class FramePoseSolver:
         best, wrong, group = contradicted
         others = replace(tracks, moving=tracks.moving | wrong)
         solution = self._judge(others, expected, last_pose, best, before)
-        return replace(solution, moving=solution.moving | group if len(solution.moving) else group)
+        return replace(solution, moving=solution.moving | group)
 
     def _contradicted(
         self, tracks: Tracks, expected: ExpectedMotion, best: PoseSolution
@@ -217,7 +214,7 @@ class FramePoseSolver:
 
     def _shifting(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
         """(N,) the `points` (N,), if they are so many and shift the pose from where all others have it; else none."""
-        shifting = np.count_nonzero(points) >= least and self.shift_chi2(tracks.keep(points), best) >= SHIFT_CHI2
+        shifting = np.count_nonzero(points) >= least and self.shift_chi2(tracks.keep(points), best) >= chi_squared(6)
         return points & shifting
 
     def _judge(
@@ -234,7 +231,7 @@ class FramePoseSolver:
         if undisturbed and usual and not self.alert:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
-        disturbed = self.alert or len(chosen.moving) > 0
+        disturbed = self.alert or bool(chosen.moving.any())
         if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
             chosen = best
         few = np.count_nonzero(chosen.inlier & static) < MIN_OPEN_SHARE * self.open_view
@@ -246,7 +243,7 @@ class FramePoseSolver:
         usual = self._likelihood(chosen.pose, expected) > USUAL_LIKELIHOOD
         if usual and self._confirmed(chosen, known, MIN_GROUP):
             return chosen
-        return _no_pose(len(tracks), "too_few_points")
+        return no_pose(len(tracks), "too_few_points")
 
     @contextmanager
     def _noise_of_at_least(self, noise: float) -> Generator[None]:
@@ -267,13 +264,16 @@ class FramePoseSolver:
         static = ~tracks.moving
         other = self._solve_rest(tracks, expected, last_pose, rest)
         agreed = None if best.reason else self._refit(tracks, expected, best, best.inlier & static, static)
-        by_static, by_near = (solve(tracks, expected, static) for solve in (self._solve_static, self._solve_near))
+        long = tracks.age * expected.seconds >= SURE_S
+        near = self._errors(tracks, expected.pose, expected.velocity) < NEAR * self._config.max_error_sigmas
+        by_static, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (long, near))
         found = [agreed, by_static, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
         if not plausible:
+            # A map update moves its points together, and the pose with them, whatever the motion.
             agree = int((best.inlier & static & tracks.mapped).sum())
-            consistent = agree >= max(CONSISTENT_SHARE * int(static.sum()), CONSISTENT_OPEN * self.open_view)
-            return best if consistent or not self.alert else _no_pose(len(tracks), "no_consensus")
+            consistent = agree >= max(TRUSTED_SHARE * int(static.sum()), TRUSTED_OPEN * self.open_view)
+            return best if consistent or not self.alert else no_pose(len(tracks), "no_consensus")
         weights = [self._support(tracks, s, expected) for s in plausible]
         k = int(np.argmax(weights))
         chosen = plausible[0] if weights[k] <= WEIGHT_RATIO * weights[0] else plausible[k]
@@ -282,7 +282,7 @@ class FramePoseSolver:
         for motion in found:
             moving = np.zeros(len(tracks), bool) if motion is None else disagree & motion.inlier
             if (moving & grouped).sum() >= MIN_GROUP:
-                chosen.moving = chosen.moving | moving if len(chosen.moving) else moving
+                chosen.moving = chosen.moving | moving
         return chosen
 
     def _support(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> float:
@@ -307,21 +307,14 @@ class FramePoseSolver:
             best.reason = "no_consensus"
         return best
 
-    def _solve_static(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
-        """Solve with the points that have been static for long, then with all their inliers; None with too few."""
-        surely_static = static & (tracks.age * expected.seconds >= SURE_S)
-        if surely_static.sum() < self._config.min_features or surely_static[static].all():
-            return None
-        return self._refit(
-            tracks, expected, self._optimise(tracks, expected, surely_static, expected), surely_static, static
-        )
+    def _solve_by(self, tracks: Tracks, expected: ExpectedMotion, by: Bool, static: Bool) -> PoseSolution | None:
+        """Solve with a part of the static points, `by` (N,), then with all their inliers; None with too few.
 
-    def _solve_near(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
-        """Solve with the points that are about where the predicted motion takes them; None with too few."""
-        near = static & (self._errors(tracks, expected.pose, expected.velocity) < NEAR * self._config.max_error_sigmas)
-        if near.sum() < self._config.min_features or near[static].all():
+        With those that have been static for long, or that are about where the predicted motion takes them.
+        """
+        if by.sum() < self._config.min_features or by[static].all():
             return None
-        return self._refit(tracks, expected, self._optimise(tracks, expected, near, expected), near, static)
+        return self._refit(tracks, expected, self._optimise(tracks, expected, by, expected), by, static)
 
     def _without_leverage_points(
         self, tracks: Tracks, expected: ExpectedMotion, static: Bool, pose: PoseSolution
@@ -398,7 +391,7 @@ class FramePoseSolver:
         moving = np.count_nonzero(tracks.moving) + np.count_nonzero(solution.moving) >= MIN_GROUP
         if self.alert and not moving:  # still there, with new points
             moving = in_group(tracks, ~tracks.moving & ~solution.inlier).sum() >= MIN_GROUP
-        self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)
+        self._alert_s = STATIC_S if moving else max(self._alert_s - seconds, 0.0)
         self._learn_noise(tracks, solution, seconds)
         if self.alert:
             return
@@ -442,17 +435,15 @@ class FramePoseSolver:
 
     def influence(self, tracks: Tracks, solution: PoseSolution) -> tuple[F64, F64]:
         """`pose_solver.influence` of points on a pose."""
-        return pose_solver.influence(
-            solution.pose, solution.velocity, solution.covariance, self._seen(tracks), self.cameras, solution.sigma_px,
-            CAUCHY_SCALES[-1],
-        )  # fmt: skip
+        return pose_solver.influence(*self._at(solution, tracks))
 
     def shift_chi2(self, tracks: Tracks, solution: PoseSolution) -> float:
         """`pose_solver.shift_chi2` of some points."""
-        return pose_solver.shift_chi2(
-            solution.pose, solution.velocity, solution.covariance, self._seen(tracks), self.cameras, solution.sigma_px,
-            CAUCHY_SCALES[-1],
-        )  # fmt: skip
+        return pose_solver.shift_chi2(*self._at(solution, tracks))
+
+    def _at(self, s: PoseSolution, tracks: Tracks) -> tuple[F64, F64, F64, SeenPoints, StereoCameras, float, float]:
+        """A pose and points as arguments of the kernels."""
+        return s.pose, s.velocity, s.covariance, self._seen(tracks), self.cameras, s.sigma_px, CAUCHY_SCALES[-1]
 
     def _optimise(
         self, tracks: Tracks, start: ExpectedMotion, static: Bool, prior: ExpectedMotion | None = None
@@ -461,8 +452,7 @@ class FramePoseSolver:
         if static.all():
             return self._optimise_all(tracks, start, prior)
         best = self._optimise_all(tracks.keep(static), start, prior)
-        best.error = self._errors(tracks, best.pose, best.velocity)
-        return best
+        return replace(best, error=self._errors(tracks, best.pose, best.velocity), moving=np.zeros(len(tracks), bool))
 
     def _errors(self, tracks: Tracks, pose: F64, velocity: F64) -> F64:
         """(N,) whitened errors of the points at a pose (4, 4), with a velocity (6,) during the readout."""
@@ -476,8 +466,11 @@ class FramePoseSolver:
             start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(), self._seen(tracks), self.cameras,
             sigma_px, CAUCHY_SCALES, start.pose if prior is None else prior.pose, sigmas,
         )  # fmt: skip
-        return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas)
+        none = np.zeros(len(error), bool)
+        return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas, none)
 
 
-def _no_pose(count: int, reason: str) -> PoseSolution:
-    return PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.full(count, np.inf), 0.0, 0.0, reason)
+def no_pose(count: int, reason: str) -> PoseSolution:
+    """Of an image with so many points."""
+    error, none = np.full(count, np.inf), np.zeros(count, bool)
+    return PoseSolution(np.eye(4), np.zeros(6), np.eye(6), error, 0.0, 0.0, none, reason)

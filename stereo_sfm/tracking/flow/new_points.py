@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.consensus import MOVING_NEIGHBOURS, Movers
+from stereo_sfm.tracking.flow.consensus import NEIGHBOURS, Movers
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pose_solver import MIN_RHO
@@ -45,7 +45,7 @@ class NewPoints:
         pose: F64,
         velocity: F64,
         most: int,
-        moving_neighbours: int = MOVING_NEIGHBOURS,
+        moving_neighbours: int = NEIGHBOURS // 2,
     ) -> Tracks:
         """The tracks followed by new ones, `most` in all; pose (4, 4) and velocity (6,) of the image.
 

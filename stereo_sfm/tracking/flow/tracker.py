@@ -23,9 +23,9 @@ from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.pixels import DARK
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.consensus import Movers, after_frame, static_frames
+from stereo_sfm.tracking.flow.consensus import TRUSTED_OPEN, TRUSTED_SHARE, Movers, after_frame, static_frames
 from stereo_sfm.tracking.flow.follower import Follower
-from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
+from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution, no_pose
 from stereo_sfm.tracking.flow.keyframes import Keyframes
 from stereo_sfm.tracking.flow.loss import Loss
 from stereo_sfm.tracking.flow.map_points import take_update
@@ -47,12 +47,9 @@ from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
-# The result without points.
-NOT_FOUND = Tracks(), PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), 0.0, 0.0, "not_found")
+NOT_FOUND = Tracks(), no_pose(0, "not_found")  # the result without points
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
-TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
-TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
-TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
+TRUSTED_LEFT = 0.5  # of the newest keyframe's points, with which a pose may be beyond doubt
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on
 REFERENCE_NS = 200_000_000  # from one image that may become the reference to the next
@@ -60,7 +57,6 @@ ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a sha
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
 REFERENCE_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
-UNKNOWN_COVARIANCE = np.eye(6)  # a metre and a radian: the odometry has not begun
 FOLLOWED_S = 0.5  # without a pose: with 2 m/s^2, a robot is a quarter of a metre from where it was expected
 FEW_RIGHT = 0.75  # of the share of points that had a right pixel before: they are looked for farther away ...
 RIGHT_LEVEL = 2  # ... from this level of the pyramids on
@@ -387,7 +383,8 @@ class Tracker:
             self._state = TrackState.INITIALIZING
             never = self._submap_id == 0 and self._keyframes.count == 0
             state = TrackState.INITIALIZING if never else TrackState.LOST
-            state, covariance = (state, UNKNOWN_COVARIANCE) if bridge is None else (TrackState.INERTIAL, bridge[1])
+            # Without sensors a metre and a radian: the odometry has not begun.
+            state, covariance = (state, np.eye(6)) if bridge is None else (TrackState.INERTIAL, bridge[1])
             return self._frame(image, self._pose, covariance, state, "too_few_points"), None
         first = self._keyframes.count == 0
         covariance = FIRST_COVARIANCE if bridge is None else bridge[1]
