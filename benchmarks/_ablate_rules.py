@@ -210,7 +210,7 @@ RULES = (
     _rule(
         "recent places",
         RECOVERY,
-        "candidates = self._places.find(_seen(image, corners), expected.odom_T_cam)",
+        "candidates = self._places.find(seen, expected.odom_T_cam)",
         "candidates: list[F64] = []",
     ),
     _rule(

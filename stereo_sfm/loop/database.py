@@ -3,15 +3,12 @@
 A query reads the whole table, a millisecond for a thousand keyframes: less than matching one of them.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
-
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.loop.vocabulary import Bag
 from stereo_sfm.mapping.columns import Columns, column
 from stereo_sfm.types import F32, F64, I32, I64
@@ -53,11 +50,10 @@ class PlaceDatabase:
 
     def scores(self, bag: Bag) -> F64:
         """(K,) L1 score in [0, 1] of every keyframe in order of insertion: 1 - |a - b|_1 / 2, the common minima."""
-        scores = np.zeros(len(self))
         self._asked[bag.words] = bag.weights
-        _add_minima(self._asked, self._words.keyframe, self._words.word, self._words.weight, scores)
+        common = np.minimum(self._asked[self._words.word], self._words.weight)
         self._asked[bag.words] = 0.0
-        return scores
+        return np.asarray(np.bincount(self._words.keyframe, common, len(self)), np.float64)
 
 
 def apart(ids: Iterable[int], radius: int, most: int, chosen: Sequence[int] = ()) -> list[int]:
@@ -67,10 +63,3 @@ def apart(ids: Iterable[int], radius: int, most: int, chosen: Sequence[int] = ()
         if len(out) < most and all(abs(k - other) > radius for other in out):
             out.append(k)
     return out
-
-
-@njit
-def _add_minima(asked, keyframe, word, weight, scores):
-    """Add what a query and each keyframe have in common of each word."""
-    for i in range(word.shape[0]):
-        scores[keyframe[i]] += min(asked[word[i]], weight[i])

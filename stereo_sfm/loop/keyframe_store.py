@@ -1,14 +1,11 @@
 """Keyframes of the loop closer and their covisibility."""
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
-
 from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.mapping.columns import FEW, SPARE, Columns, column
 from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.types import I32, I64, Keyframe
@@ -98,11 +95,9 @@ class KeyframeStore:
 
     def _shared(self, point_ids: I64) -> I64:
         """(K,) how many of these points each keyframe sees."""
-        points, counts = self._points.find(point_ids), np.zeros(len(self.ids), np.int64)
-        asked = np.zeros(self._count, bool)
+        points, asked = self._points.find(point_ids), np.zeros(self._count, bool)
         asked[points[points >= 0]] = True
-        _count(asked, self._sightings.kf, self._sightings.point, counts)
-        return counts
+        return np.bincount(self._sightings.kf[asked[self._sightings.point]], minlength=len(self.ids))
 
     def connected(self, point_ids: I64, min_points: int) -> list[int]:
         """Keyframes that share at least `min_points` of these points, ascending."""
@@ -114,10 +109,3 @@ class KeyframeStore:
         counts[self.ids.index(kf_id)] = 0
         best = np.argsort(-counts, kind="stable")[:count]
         return [self.ids[k] for k in best[counts[best] > 0].tolist()]
-
-
-@njit
-def _count(asked, kf, point, counts):
-    """Add to counts (K,) how many of the points that are asked for each keyframe sees."""
-    for i in range(kf.shape[0]):
-        counts[kf[i]] += asked[point[i]]

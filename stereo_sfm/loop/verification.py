@@ -18,11 +18,11 @@ from stereo_sfm.loop.absolute_pose import Matches, Pose, consistent, ransac_pose
 from stereo_sfm.loop.cloud import Cloud, match_guided
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from stereo_sfm.tracking.flow.visible_area import cells_of
 from stereo_sfm.types import F64, I64, Keyframe
 
 GUIDED = (12.0, 4), (6.0, 10)  # rounds of guided matching: radius of the search in px, maximum of iterations
 FIRST_SHARE = 0.4  # of the required inliers that the pose from three points must have: guided matching finds more
-GRID = (8, 6)  # columns, rows of `LoopConfig.min_cells`
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 
 
@@ -103,7 +103,7 @@ def verify_near(
     inliers, share = len(corners), len(corners) / max(int(view.corner.sum()), 1)
     if inliers < config.min_inliers or share < config.min_inlier_share:
         return rejection("too_few_inliers", inliers)
-    if occupied_cells(view.uv_left[corners], rig.left.size) < config.min_cells:
+    if len(np.unique(cells_of(view.uv_left[corners], rig.left.size))) < config.min_cells:
         return rejection("not_spread", inliers)
     if move_points:
         b_T_a = refine_with_points(b_T_a, view, cloud, rows_b, rows_a, rig, config)
@@ -157,13 +157,6 @@ def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
     left, right, points, sigmas = (c[rows_b] for c in (view.uv_left, view.uv_right, view.points, view.sigmas))
     known_a, seen_a = (cloud.points[rows_a], cloud.sigmas[rows_a]), cloud.seen_by_centre(rows_a)
     return Matches(*known_a, left, right, points, sigmas, *seen_a)
-
-
-def occupied_cells(uv: F64, size: tuple[int, int]) -> int:
-    """Number of cells of an 8 x 6 grid over the image that contain a point."""
-    column = np.clip((uv[:, 0] * GRID[0] / size[0]).astype(int), 0, GRID[0] - 1)
-    row = np.clip((uv[:, 1] * GRID[1] / size[1]).astype(int), 0, GRID[1] - 1)
-    return len(np.unique(row * GRID[0] + column))
 
 
 def within(error: F64, metres: float, degrees: float) -> bool:

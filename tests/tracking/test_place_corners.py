@@ -13,10 +13,10 @@ from stereo_sfm.config import load
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.verification import occupied_cells
 from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.tracking.flow.keyframes import FIRST, SPACING
+from stereo_sfm.tracking.flow.visible_area import cells_of
 from stereo_sfm.types import F32, F64, U8, Corners, Keyframe, StereoImage
 
 SOURCE = "sim:loop?size=424x400&rate=10"
@@ -61,7 +61,7 @@ def test_corners_are_found_again_a_step_further(sequence: SimSource, rows: tuple
 
 def test_corners_lie_all_over_the_image_and_have_depth(sequence: SimSource) -> None:
     corners = keyframe_at(sequence, 40)[0].corners
-    assert occupied_cells(corners.uv_left.astype(np.float64), sequence.rig.left.size) > 20
+    assert len(np.unique(cells_of(corners.uv_left.astype(np.float64), sequence.rig.left.size))) > 20
     assert np.isfinite(corners.points_cam).all() and np.isfinite(corners.uv_right).all()
     assert sequence.rig.right is not None
     right = sequence.rig.project_right(corners.points_cam)

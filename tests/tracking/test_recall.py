@@ -9,9 +9,8 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.tracking.flow.consensus import Movers
 from stereo_sfm.tracking.flow.follower import Follower
-from stereo_sfm.tracking.flow.klt import Pyramid, build_pyramid
+from stereo_sfm.tracking.flow.klt import Pyramid, StereoPyramids, build_pyramid
 from stereo_sfm.tracking.flow.new_points import NewPoints
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
 from stereo_sfm.tracking.flow.tracks import Tracks

@@ -20,9 +20,9 @@ from stereo_sfm.loop.recent_places import RecentPlaces
 from stereo_sfm.pipeline.stages import make_tracker_with_places
 from stereo_sfm.tracking.flow.follower import Follower, ReferenceImage
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.klt import StereoPyramids
 from stereo_sfm.tracking.flow.motion_prior import MotionPrior
 from stereo_sfm.tracking.flow.partial_view import PartialView
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import REACH, Recovery
 from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.tracking.flow.tracks import Tracks

@@ -14,15 +14,23 @@ import numpy as np
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.geometry.kernels import njit, project_one
-from stereo_sfm.tracking.flow.klt import Pyramid
+from stereo_sfm.geometry.kernels import inlined, njit, project_one
+from stereo_sfm.tracking.flow.klt import COARSE, Pyramid
 from stereo_sfm.types import F64
 
 ITERATIONS = 12  # on each level, at most: an alignment that has not ended by then does not converge
-STEP = 0.1  # pixels of the level below which a step ends its iterations
 SEARCHED = 0.25  # of the field of view: rotations to either side that are tried where no prediction holds
 SPACING_PX = 2  # of the smallest level, from one of them to the next: the alignment reaches as far
 COMPARED = 1000  # pixels of the smallest level by which they are compared
+
+
+@inlined
+def _turned(r, b, model, params):
+    """A bearing (3,) turned by a rotation (3, 3), and its pixel with the derivatives."""
+    x = r[0, 0] * b[0] + r[0, 1] * b[1] + r[0, 2] * b[2]
+    y = r[1, 0] * b[0] + r[1, 1] * b[1] + r[1, 2] * b[2]
+    z = r[2, 0] * b[0] + r[2, 1] * b[1] + r[2, 2] * b[2]
+    return x, y, z, project_one(model, params, x, y, z)
 
 
 @njit
@@ -41,11 +49,7 @@ def _normal_equations(prev, cur, bearings, stride, model, params, scale, rotatio
         for u in range(w):
             if math.isnan(bearings[v, u, 0]):
                 continue
-            b = bearings[v, u]
-            x = rotation[0, 0] * b[0] + rotation[0, 1] * b[1] + rotation[0, 2] * b[2]
-            y = rotation[1, 0] * b[0] + rotation[1, 1] * b[1] + rotation[1, 2] * b[2]
-            z = rotation[2, 0] * b[0] + rotation[2, 1] * b[1] + rotation[2, 2] * b[2]
-            p = project_one(model, params, x, y, z)
+            x, y, z, p = _turned(rotation, bearings[v, u], model, params)
             if math.isnan(p[0]):
                 continue
             cu, cv = p[0] / scale, p[1] / scale
@@ -94,10 +98,7 @@ def _similarities(prev, cur, bearings, stride, model, params, scale, rotations):
                 if math.isnan(b[0]):
                     continue
                 total += 1
-                x = r[0, 0] * b[0] + r[0, 1] * b[1] + r[0, 2] * b[2]
-                y = r[1, 0] * b[0] + r[1, 1] * b[1] + r[1, 2] * b[2]
-                z = r[2, 0] * b[0] + r[2, 1] * b[1] + r[2, 2] * b[2]
-                p = project_one(model, params, x, y, z)
+                p = _turned(r, b, model, params)[3]
                 if math.isnan(p[0]):
                     continue
                 cu, cv = int(round(p[0] / scale)), int(round(p[1] / scale))
@@ -160,6 +161,6 @@ class CoarseRotation:
                     return np.ascontiguousarray(cur_R_prev)
                 step = -np.linalg.solve(normal, rhs)
                 rotation = np.ascontiguousarray(se3.so3_exp(step) @ rotation)
-                if np.linalg.norm(step) < STEP * 2**level / self._camera.fx:
+                if np.linalg.norm(step) < COARSE * 2**level / self._camera.fx:
                     break
         return rotation

@@ -15,11 +15,11 @@ from stereo_sfm.geometry.order_statistics import median_distance
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
+from stereo_sfm.tracking.flow.klt import StereoPyramids
 from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps, surfaces_around
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.tracks import Patches, Tracks
-from stereo_sfm.tracking.flow.visible_area import VisibleArea
+from stereo_sfm.tracking.flow.visible_area import GRID, VisibleArea, cells_of
 from stereo_sfm.tracking.flow.window_curvature import window_curvatures, window_rays
 from stereo_sfm.types import F64, I64, Bool
 
@@ -27,7 +27,6 @@ WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the searc
 ALIGNED_PX = 1.5  # the same, below which first appearances are aligned from the predictions
 STORED = 4  # times max_features: points of the last image and of the reference image, and new ones of it
 MIN_COARSE_NCC = 0.65  # of a window found again in the half image
-GRID = 8, 6  # columns and rows of the image
 CELL_POINTS = 4.0  # with which a cell counts fully
 NEARER = 0.6  # of the distance of what should be in a cell: what is nearer covers it
 SEARCH_STEPS = 14  # offsets of a search on either side
@@ -111,7 +110,7 @@ class Follower:
         longer = np.maximum(np.einsum("ni,ni->n", rays, rays), np.einsum("ni,ni->n", now, now))
         similarity = np.maximum(np.einsum("ni,ni->n", rays, now) / longer, 0.0)
         inside = self._area.inside(uv)
-        cells = np.bincount(self._cells(uv[inside]), similarity[inside], math.prod(GRID))
+        cells = np.bincount(cells_of(uv[inside], self._camera.size), similarity[inside], math.prod(GRID))
         return float(np.minimum(cells, CELL_POINTS).sum())
 
     def forget(self) -> None:
@@ -168,7 +167,7 @@ class Follower:
         """
         uv, warps = self._seen_from(pose)
         visible = self._visible(uv, warps)
-        cell, cells = self._cells(uv[visible]), math.prod(GRID)
+        cell, cells = cells_of(uv[visible], self._camera.size), math.prod(GRID)
         change = np.abs(np.log(np.linalg.norm(warps[:, visible], axis=(2, 3)) / math.sqrt(2.0)))
         wanted: F64 = np.asarray(np.bincount(cell, np.exp(-np.nanmin(change, axis=0)), cells), np.float64)
         views = [wanted]
@@ -176,17 +175,11 @@ class Follower:
             distance = np.linalg.norm(se3.transform(se3.inverse(pose), self.reference.tracks.points()[visible]), axis=1)
             nearest = np.full(cells, np.inf)
             np.minimum.at(nearest, cell, distance)
-            at = self._cells(self._camera.project(seen))
+            at = cells_of(self._camera.project(seen), self._camera.size)
             open_view = np.linalg.norm(seen, axis=1) >= NEARER * nearest[at]
             views.append(np.where(np.bincount(at[open_view], minlength=cells) > 0, wanted, 0.0))
-        again: F64 = np.asarray(np.bincount(self._cells(found), minlength=cells), np.float64)
+        again: F64 = np.asarray(np.bincount(cells_of(found, self._camera.size), minlength=cells), np.float64)
         return max(_agreement(again, view, cells_needed) for view in views)
-
-    def _cells(self, uv: F64) -> I64:
-        """(N,) the cells of the grid over the image that pixels (N, 2) are in."""
-        size = self._camera.width, self._camera.height
-        column, row = (np.clip(uv[:, k] * GRID[k] / size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1))
-        return np.asarray(row * GRID[0] + column)
 
     def _seen_from(self, pose: F64) -> tuple[F64, F64]:
         """Pixels (N, 2) of the reference points, NaN behind the camera, and their deformations since (3, N, 2, 2)."""

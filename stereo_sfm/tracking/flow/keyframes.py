@@ -13,8 +13,8 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.flow.consensus import Movers, without_moving
+from stereo_sfm.tracking.flow.klt import StereoPyramids
 from stereo_sfm.tracking.flow.place_corners import SCALE, PlaceCorners
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
@@ -28,6 +28,22 @@ CORRELATED_S = 5.0  # for which the error of gravity's direction stays about the
 # Odometry between keyframes: pixels err together, so that poses are less certain than their points say, and points that
 # are no longer seen took their errors along: metres and radians, at least.
 ODOMETRY_SIGMAS, MIN_ODOMETRY_SIGMAS = 2.0, (0.003, 0.002)
+
+
+def without_points(image: StereoImage, kf_id: int, odom_T_cam: F64, **fields: Any) -> Keyframe:
+    """A keyframe of an image, with further fields but without tracked points."""
+    return Keyframe(
+        kf_id=kf_id,
+        frame_id=image.frame_id,
+        stamp_ns=image.stamp_ns,
+        odom_T_cam=odom_T_cam,
+        point_ids=np.zeros(0, np.int64),
+        uv_left=np.zeros((0, 2)),
+        uv_right=np.zeros((0, 2)),
+        points_cam=np.zeros((0, 3)),
+        descriptors=np.zeros((0, 32), np.uint8),
+        **fields,
+    )
 
 
 class Keyframes:
@@ -98,16 +114,10 @@ class Keyframes:
             odom_T_cam: (4, 4), which the sensors have accepted. covariance: (6, 6) of it. rig_terms: (8,) current
                 correction of the rig. sudden: rotation of the right camera besides.
         """
-        keyframe = Keyframe(
-            kf_id=self.count,
-            frame_id=image.frame_id,
-            stamp_ns=image.stamp_ns,
-            odom_T_cam=odom_T_cam.copy(),
-            point_ids=np.zeros(0, np.int64),
-            uv_left=np.zeros((0, 2)),
-            uv_right=np.zeros((0, 2)),
-            points_cam=np.zeros((0, 3)),
-            descriptors=np.zeros((0, 32), np.uint8),
+        keyframe = without_points(
+            image,
+            self.count,
+            odom_T_cam.copy(),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
             **({} if sudden is None else {"right_turn": sudden.turn, "right_turn_covariance": sudden.covariance}),

@@ -12,6 +12,7 @@ against its first appearance removes the drift, and its dissimilarity detects wi
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -27,6 +28,14 @@ FINE, COARSE = 0.01, 0.1  # px, last step of an alignment: in the image itself, 
 ITERATIONS = 10  # on each level, at most: most need four
 
 Pyramid = tuple[U8, ...]
+
+
+@dataclass(frozen=True)
+class StereoPyramids:
+    """Input of the flow tracker from one stereo image."""
+
+    left: Pyramid
+    right: Pyramid | F32  # the second camera's pyramid, or the depth image of an RGB-D camera
 
 
 class Appearances(NamedTuple):

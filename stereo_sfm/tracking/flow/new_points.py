@@ -10,8 +10,8 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.tracking.flow.consensus import NEIGHBOURS, Movers
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
+from stereo_sfm.tracking.flow.klt import StereoPyramids
 from stereo_sfm.tracking.flow.pose_solver import MIN_RHO
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
 from stereo_sfm.tracking.flow.tracks import Tracks

@@ -10,10 +10,12 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.consensus import MIN_GROUP
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.keyframes import without_points
+from stereo_sfm.tracking.flow.klt import StereoPyramids
 from stereo_sfm.tracking.flow.motion_prior import Expectation, MotionPrior
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.tracking.flow.visible_area import cells_of
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
@@ -81,7 +83,8 @@ class Recovery:
             yield from (others[(self._next + k) % len(others)] for k in range(MOTIONS_AT_ONCE))
             self._next += MOTIONS_AT_ONCE
         if len(corners):
-            candidates = self._places.find(_seen(image, corners), expected.odom_T_cam)
+            seen = without_points(image, -1, np.eye(4), corners=corners)
+            candidates = self._places.find(seen, expected.odom_T_cam)
             yield from (pose for pose in candidates if expected.sigmas_off(pose) < REACH)
 
     def possible(
@@ -111,8 +114,8 @@ class Recovery:
     def _occupied(self, corners: Corners) -> F64:
         """(rows,) number of cells of the image with a corner that is not on an object close to the camera."""
         uv = corners.uv_left[np.linalg.norm(corners.points_cam, axis=1) > self._near]
-        column, row = (np.clip(uv[:, k] * GRID[k] / self._size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1))
-        return np.bincount(np.unique(row * GRID[0] + column) // GRID[0], minlength=GRID[1]).astype(np.float64)
+        occupied = np.unique(cells_of(uv, self._size, GRID))
+        return np.bincount(occupied // GRID[0], minlength=GRID[1]).astype(np.float64)
 
 
 def _recall_needed(prediction: Expectation, pose: F64) -> float:
@@ -125,19 +128,3 @@ def within(a: F64, b: F64, metres: float, radians: float) -> bool:
     """Whether two poses (4, 4) differ by less than a translation and a rotation."""
     moved, turned = se3.extent(se3.inverse(a) @ b)
     return bool(moved < metres and turned < radians)
-
-
-def _seen(image: StereoImage, corners: Corners) -> Keyframe:
-    """The place-recognition part of a keyframe, of an image that is none."""
-    return Keyframe(
-        kf_id=-1,
-        frame_id=image.frame_id,
-        stamp_ns=image.stamp_ns,
-        odom_T_cam=np.eye(4),
-        point_ids=np.zeros(0, np.int64),
-        uv_left=np.zeros((0, 2)),
-        uv_right=np.zeros((0, 2)),
-        points_cam=np.zeros((0, 3)),
-        descriptors=np.zeros((0, 32), np.uint8),
-        corners=corners,
-    )

@@ -27,13 +27,13 @@ from stereo_sfm.tracking.flow.consensus import TRUSTED_OPEN, TRUSTED_SHARE, Move
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution, no_pose
 from stereo_sfm.tracking.flow.keyframes import Keyframes
+from stereo_sfm.tracking.flow.klt import StereoPyramids
 from stereo_sfm.tracking.flow.loss import Loss
 from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.motion_prior import Expectation
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
-from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery, within
 from stereo_sfm.tracking.flow.rig_change import triangulate_tracks
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
@@ -469,10 +469,7 @@ class Tracker:
         tracks, solution = NOT_FOUND
         for reach, most in ROUNDS:
             motion = ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
-            tracks = self._follower.find_again(images.left, pose, reach, most)
-            tracks.uv_right = self._stereo.follow(
-                images.left, images.right, tracks.uv, tracks.points(), pose, tracks.right_offset
-            )
+            tracks = self._match_right(self._follower.find_again(images.left, pose, reach, most), images, motion)
             solution = self._solver.solve_again(tracks, motion)
             if solution.reason or any(within(solution.pose, other, *SAME_PLACE) for other in known):
                 return NOT_FOUND

@@ -17,7 +17,7 @@ from stereo_sfm.calib.mask import half_size, uncovered
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.tracking.flow.corners import corner_mask
-from stereo_sfm.types import F64, U8, Bool
+from stereo_sfm.types import F32, F64, I64, U8, Bool
 
 STEP = 2  # px of the half image between the sampled ones
 CENTRE_DEG = 45.0  # angle from the axis within which the brightness is that of the scene
@@ -25,6 +25,13 @@ MIN_RIM_DEG = 60.0  # smaller angles are dark surroundings, not the rim
 LIT = 0.3  # of the median brightness in the centre, above which a pixel is bright
 LIT_SHARE = 0.1  # of bright pixels at one angle, above which it is inside the image circle
 WINDOW = 7  # px of the half image: margin to the rim for the windows of points
+GRID = 8, 6  # columns and rows of cells, over which points should be spread
+
+
+def cells_of(uv: F64 | F32, size: tuple[int, int], grid: tuple[int, int] = GRID) -> I64:
+    """(N,) cells, row by row, of a grid over an image of that size that pixels (N, 2) are in."""
+    cell = np.clip(uv * grid / size, 0, np.subtract(grid, 1)).astype(np.int64)
+    return cell[:, 1] * grid[0] + cell[:, 0]
 
 
 class VisibleArea:
