@@ -14,9 +14,9 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.mapping import map_kernels
+from stereo_sfm.mapping.bundle import adjust_pose
 from stereo_sfm.mapping.culling import OF_A_VIEW, SAME_VIEW_DEPTHS
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
 ALIKE_COS = 0.8  # cosine of 37 degrees, up to which a view of a point looks like the first

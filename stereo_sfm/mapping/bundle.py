@@ -408,6 +408,27 @@ def bundle_adjust(rig: Rig | Sequence[Rig], bundle: Bundle, config: BundleConfig
     return _result(solver, bundle, state, initial, iterations, converged)
 
 
+def adjust_pose(
+    rig: Rig, world_T_cam: F64, points: F64, uv_left: F64, uv_right: F64, sigma: F64, huber: float
+) -> tuple[F64, Bool]:
+    """The pose of one keyframe that minimises the robust reprojection error of fixed points in both images.
+
+    Args:
+        world_T_cam: (4, 4) start. points: (N, 3) world. uv_left, uv_right: (N, 2) px, NaN where unseen; only the row
+            NaN: the column alone counts. sigma: (N,) px. huber: sigmas where the loss turns linear.
+
+    Returns:
+        (4, 4) pose, and (N, 2) which observations agree with it, in the left and the right image.
+    """
+    rows, sigmas = np.arange(len(points)), np.repeat(np.asarray(sigma, float)[:, None], 2, axis=1)
+    bundle = Bundle(
+        np.array(world_T_cam, float)[None], np.zeros(1, bool), points, np.zeros_like(rows), rows, uv_left, uv_right,
+        sigmas, points_stay=True,
+    )  # fmt: skip
+    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=huber))
+    return result.world_T_kf[0], result.inlier
+
+
 def _result(
     solver: _Solver, bundle: Bundle, state: _State, initial: float, iterations: int, converged: bool
 ) -> BundleResult:

@@ -18,7 +18,6 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.chi_squared import chi_squared
-from stereo_sfm.mapping.averaging import average_correction
 from stereo_sfm.mapping.level import weights
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_graph import Edges, Gravity, edges_of_poses, join, optimise
@@ -124,6 +123,28 @@ def _averaged(map_: Map, before: F64, loop: LoopResult, a: int, b: int) -> F64:
         before[rows], first, int(np.searchsorted(rows, b)), before[a] @ loop.candidate_T_kf
     )
     return after
+
+
+def average_correction(poses: F64, first: int, last: int, corrected: F64) -> F64:
+    """Transformation averaging (retail paper, section IV-C3): a loop's error, spread evenly over the keyframes.
+
+    New poses (K, 4, 4) when keyframe row `last` must be at `corrected` (4, 4) and row `first` stays. Rows up to `first`
+    keep their poses, rows after `last` move with it as a rigid body. Translation and rotation error are spread
+    separately and linearly, as the paper does. It is exact only where the error grew evenly and the path is straight:
+    turning a keyframe in place does not swing the ones after it.
+    """
+    out = poses.copy()
+    count = last - first
+    if count <= 0:
+        return out
+    shift = corrected[:3, 3] - poses[last, :3, 3]
+    turn = se3.so3_log(corrected[:3, :3] @ poses[last, :3, :3].T)
+    share = np.arange(1, count + 1) / count
+    rows = np.arange(first + 1, last + 1)
+    out[rows, :3, 3] += share[:, None] * shift
+    out[rows, :3, :3] = se3.so3_exp(share[:, None] * turn) @ poses[rows, :3, :3]
+    out[last + 1 :] = corrected @ se3.inverse(poses[last]) @ poses[last + 1 :]
+    return out
 
 
 def _optimised(

@@ -8,9 +8,9 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.association import find_again
+from stereo_sfm.mapping.bundle import adjust_pose
 from stereo_sfm.mapping.map import POSE_POINTS, Map
 from stereo_sfm.mapping.motions import Motion
-from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
 

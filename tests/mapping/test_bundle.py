@@ -11,8 +11,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Epipolar
-from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
-from stereo_sfm.mapping.pose_only import adjust_pose
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, adjust_pose, bundle_adjust
 from tests import gtsam_oracle
 from tests.synthetic import Scene, disturb, fisheye_rig, make_scene, pinhole_rig
 

@@ -7,7 +7,7 @@ import pytest
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.averaging import average_correction
+from stereo_sfm.mapping.correction import average_correction
 from stereo_sfm.mapping.pose_graph import Edges, edges_of_poses, join, optimise
 from stereo_sfm.types import F64
 

@@ -84,6 +84,21 @@ class NewPoints:
         self._next_point_id += n
         return tracks
 
+    def triangulate_again(self, tracks: Tracks, pose: F64, velocity: F64) -> None:
+        """Place the tracks of the last image, at a pose (4, 4) with a velocity (6,), by the rig as it is known now.
+
+        Those that the second camera does not see keep their positions. None is taken for moving: what contradicted
+        another rig need not contradict this one.
+        """
+        match = self._stereo.placed(tracks.uv, tracks.uv_right)
+        seen = match.good
+        origin, direction = self._shutter.rays(pose, velocity, tracks.uv[seen], match.bearing[seen])
+        tracks.origin[seen], tracks.direction[seen] = origin, direction
+        tracks.rho[seen] = np.maximum(match.rho[seen], MIN_RHO)
+        tracks.variance[seen], tracks.right_offset[seen] = match.variance[seen], match.offset[seen]
+        tracks.mapped[seen] = False
+        tracks.moving[:], tracks.misses[:] = False, 0
+
     def seen(self, images: StereoPyramids) -> F64:
         """(M, 3) metres in the camera, none behind it: corners spread over the image, as many as are tracked."""
         most = self._config.max_features

@@ -35,7 +35,6 @@ from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery, within
-from stereo_sfm.tracking.flow.rig_change import triangulate_tracks
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
@@ -129,7 +128,7 @@ class Tracker:
                 self._sudden.confirmed((update.calibration.terms - self._rig_terms)[:3])
             self._rig_terms = update.calibration.terms
             self._use_rig()
-            self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
+            self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
         elif self._turn.any():  # the map does not know it yet
             update = replace(update, point_ids=update.point_ids[:0], points_map=update.points_map[:0])
         self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
