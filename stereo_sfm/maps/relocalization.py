@@ -29,10 +29,10 @@ from stereo_sfm.loop.sideways import (
 from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.snapshot import MapSnapshot
+from stereo_sfm.tracking.flow.recovery import RIVAL
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: lamps and products repeat at larger steps
-AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
 MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
 PLACES = 16  # that are verified for an image, and for its side views, where no confident one ends the search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
@@ -167,7 +167,7 @@ class Relocalizer:
             weights.append(np.where(view.corner, words.idf[words.look_up(view.descriptors)] ** 2, 0.0))
         evidence = [self._evidence(keyframe, weights, place) for place in places]
         order = np.argsort(-np.array(evidence), kind="stable").tolist()
-        if len(order) > 1 and evidence[order[1]] > AMBIGUITY_RATIO * evidence[order[0]]:
+        if len(order) > 1 and evidence[order[1]] > RIVAL * evidence[order[0]]:
             return not_found("ambiguous", places[order[0]].inliers)
         if not order or evidence[order[0]] < CLOSER_SHARE * sum(float(w.sum()) for w in weights):
             return not_found("ambiguous")
@@ -309,6 +309,6 @@ class Relocalizer:
         if best.reason:
             return not_found(best.reason, best.inliers)
         for other in found:
-            if _distinct(best, other) and other.agreeing > AMBIGUITY_RATIO * best.agreeing:
+            if _distinct(best, other) and other.agreeing > RIVAL * best.agreeing:
                 return not_found("ambiguous", best.inliers)
         return best

@@ -27,7 +27,7 @@ MOTIONS_AT_ONCE = 2  # of them in an image, besides the straight ones
 GRID = (16, 12)  # columns and rows of the image in which corners are counted: fine against the rim beside a cover
 SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
-RIVAL = 0.75  # share of the best recall with which another place makes the result ambiguous
+RIVAL = 0.75  # share of what speaks for the best place with which another one makes the result ambiguous
 # Recall that is needed, the rest may still be covered: for a prediction that is certain, more per metre of its standard
 # deviation, up to a sufficient one, and the least again per standard deviation between the pose and the prediction.
 # Ceiling and floor alone, where lamps are taken for the next ones, have 0.43 to 0.64; right poses after 3 to 4 m unseen
