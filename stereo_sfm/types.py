@@ -203,7 +203,7 @@ class Frame(Message):
     covariance: F64 = field(metadata=shape(6, 6))
     state: TrackState  # what is known about the pose
     # "" where the pose is good, else why not, a short stable word: "dark", "too_few_points", "no_consensus",
-    # "not_found"; the estimators of --odometry have further ones ("low_parallax", "ill_conditioned", ...)
+    # "not_found", "first_image"; the estimators of --odometry have others ("low_parallax", "ill_conditioned", ...)
     reason: str
     observations: Observations  # the points seen; empty where the pose is only predicted
     reference_kf_id: int  # keyframe that the frame moves with in the map, -1 before the first

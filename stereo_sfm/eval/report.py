@@ -21,6 +21,7 @@ ADVICE = {
     "dark": "images were dark: use more light or a longer exposure",
     "too_few_points": "too few points could be tracked: check the images (blur, bare walls, a covered lens)",
     "no_consensus": "points did not agree on one motion: people or carts in view, or a wrong calibration",
+    "first_image": "a rolling shutter needs a second image that tells how fast the camera moves",
     "not_found": "the camera saw no known place: clear its view, or drive back to where tracking last worked",
 }
 SHOWN_ROWS = 50  # of a table

@@ -18,7 +18,7 @@ from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracker import Tracker
-from stereo_sfm.types import F64, Corners, StereoImage, Trajectory
+from stereo_sfm.types import F64, Corners, StereoImage, TrackState, Trajectory
 
 LEFT_T_RIGHT = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
 CAMERAS = [
@@ -148,7 +148,8 @@ def test_nearly_equal_stamps_do_not_disturb() -> None:
 
 def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
     tracker = Tracker(load().tracker, rig)
-    frames = [tracker.step(image)[0] for image in images]
+    frames = [f for image in images if (f := tracker.step(image)[0]).state == TrackState.OK]
+    assert len(frames) >= len(images) - 1
     poses = np.array([f.odom_T_cam for f in frames])
     return evaluate(Trajectory(np.array([f.stamp_ns for f in frames]), poses), truth).ape_m.rmse * 1e3
 
@@ -179,7 +180,7 @@ def test_keyframes_of_a_rendered_sequence_are_those_of_a_global_shutter() -> Non
         off, moved = [], []
         for image in source:
             _, keyframe = tracker.step(image)
-            if keyframe is None or keyframe.kf_id == 0:  # at the first the velocity is not known
+            if keyframe is None:
                 continue
             keyframe = tracker.describe(keyframe)
             left = rig.left.project(keyframe.points_cam)
@@ -193,4 +194,4 @@ def test_keyframes_of_a_rendered_sequence_are_those_of_a_global_shutter() -> Non
             moved.append(np.hypot(*(keyframe.corners.uv_left - seen.uv_left).T))
     assert len(moved) > 3
     assert np.nanpercentile(np.concatenate(off), 90) < 0.7
-    assert np.percentile(np.concatenate(moved), 90) > 1.0
+    assert np.percentile(np.concatenate(moved), 90) > 0.8
