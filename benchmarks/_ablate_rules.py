@@ -130,6 +130,12 @@ RULES = (
     _rule("new points in each crowded image", TRACKER, "or self._solver.crowded(self._static_count())", ""),
     # The motion filter.
     _rule(
+        "learned limits of motion",
+        SOLVER,
+        "quadratic = np.maximum(quadratic, LIMIT_SIGMAS * np.sqrt(self._difference))",
+        "pass",
+    ),
+    _rule(
         "learned differences of motion",
         SOLVER,
         "np.maximum(quadratic, factor * np.sqrt(self._difference))",
@@ -167,7 +173,7 @@ RULES = (
     _rule(
         "recall by distance from the prediction",
         RECOVERY,
-        "return MIN_RECALL * off + min(MIN_RECALL + RECALL_PER_METRE * prediction.sigma_m, SUFFICIENT_RECALL)",
+        "return MIN_RECALL * (1.0 + off) + RECALL_PER_METRE * min(prediction.sigma_m, MAX_SIGMA_M)",
         "return MIN_RECALL",
     ),
     _rule(

@@ -40,9 +40,10 @@ REAPPEARED_NOISE = 1.0  # over config.sigma_px, at least: windows that changed m
 BLURRED_NOISE = 2.0  # the same for windows in a blurred image
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 10.0)  # over config.sigma_px: the noise of the best images, and what still is a match
-# Standard deviations of a robot's differences from the prediction, metres and m/s^2, radians and rad/s^2, and root mean
-# squares of the recent ones, if that is more. What moves before the camera may have more points, and older ones, than
-# the store; the camera goes on as before.
+# Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
+MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
+# Standard deviations of a robot's differences, and root mean squares of the recent ones, if that is more. What moves
+# before the camera may have more points, and older ones, than the store; the camera goes on as before.
 USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
 UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
@@ -56,7 +57,7 @@ NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
 KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
-LIMIT_SIGMAS = 5.0  # of those differences, which are possible
+LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
 MIN_DEPTH_SIGMA = 1e-3  # relative
 
@@ -368,7 +369,9 @@ class FramePoseSolver:
     def _plausible(self, pose: F64, expected: ExpectedMotion) -> bool:
         """Whether a pose differs from the predicted one by no more than the recent accelerations explain."""
         off = np.array(se3.extent(se3.inverse(expected.pose) @ pose))
-        return bool((off < LIMIT_SIGMAS * self._usual_sigmas(expected, 1.0)).all())
+        constant, quadratic = np.array(MIN_LIMITS).T
+        quadratic = np.maximum(quadratic, LIMIT_SIGMAS * np.sqrt(self._difference))
+        return bool((off < constant + quadratic * expected.seconds**2).all())
 
     def _likelihood(self, pose: F64, expected: ExpectedMotion) -> float:
         """Of a pose by the recent accelerations and those of a robot, 1 for the predicted one, UNLIKELY at least."""

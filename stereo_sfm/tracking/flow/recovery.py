@@ -8,7 +8,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.flow.consensus import AGREEING_SHARE, MIN_GROUP
+from stereo_sfm.tracking.flow.consensus import MIN_GROUP
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
 from stereo_sfm.tracking.flow.keyframes import without_points
 from stereo_sfm.tracking.flow.klt import StereoPyramids
@@ -28,11 +28,13 @@ GRID = (16, 12)  # columns and rows of the image in which corners are counted: f
 SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
 RIVAL = 0.75  # share of what speaks for the best place with which another one makes the result ambiguous
-# Recall that is needed, the rest may still be covered: for a prediction that is certain, more per metre of its standard
-# deviation, up to a sufficient one, and the least again per standard deviation between the pose and the prediction.
-# Ceiling and floor alone, where lamps are taken for the next ones, have 0.43 to 0.64; right poses after 3 to 4 m unseen
+MIN_INLIER_SHARE = 0.6  # of the points that are found
+# Recall that is needed, the rest may still be covered: for a pose that is certain, as much again per standard deviation
+# between the pose and the prediction, and more for a prediction with a standard deviation, up to the largest. Ceiling
+# and floor alone, where lamps are taken for the next ones, have 0.43 to 0.64; right poses after 3 to 4 m without sight
 # 0.69 to 0.84.
 MIN_RECALL, RECALL_PER_METRE = 0.1, 0.7
+MAX_SIGMA_M = 0.8
 # Of the cells with corners in the newest keyframes, row by row, with which the view is open again. An open one has 0.63
 # of them at least, also after a turn; the rim around a cover 0.47 at most, although it has half as many cells.
 OPEN_SHARE = 0.5
@@ -95,7 +97,7 @@ class Recovery:
         seen by chance only.
         """
         share = solution.inliers / max(len(solution.error), 1)
-        if solution.inliers < 2 * MIN_GROUP or share < AGREEING_SHARE:
+        if solution.inliers < 2 * MIN_GROUP or share < MIN_INLIER_SHARE:
             return False
         predictions = [expected] if steady is None or steady.sigmas_off(solution.pose) > REACH else [expected, steady]
         needed = min(_recall_needed(prediction, solution.pose) for prediction in predictions)
@@ -119,7 +121,7 @@ class Recovery:
 def _recall_needed(prediction: Expectation, pose: F64) -> float:
     """The least recall of a pose (4, 4)."""
     off = prediction.sigmas_off(pose)
-    return MIN_RECALL * off + min(MIN_RECALL + RECALL_PER_METRE * prediction.sigma_m, SUFFICIENT_RECALL)
+    return MIN_RECALL * (1.0 + off) + RECALL_PER_METRE * min(prediction.sigma_m, MAX_SIGMA_M)
 
 
 def within(a: F64, b: F64, metres: float, radians: float) -> bool:

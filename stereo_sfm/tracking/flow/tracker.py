@@ -49,6 +49,7 @@ from stereo_sfm.types import F64, RIG_TERMS, Bool, Frame, Keyframe, MapUpdate, O
 NOT_FOUND = Tracks(), no_pose(0, "not_found")  # the result without points
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
 TRUSTED_LEFT = 0.5  # of the newest keyframe's points, with which a pose may be beyond doubt
+SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on
 REFERENCE_NS = 200_000_000  # from one image that may become the reference to the next
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
@@ -443,7 +444,7 @@ class Tracker:
         tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
         for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
-            if not any(within(pose, other, *SAME_PLACE) for other in tried):
+            if not any(within(pose, other, *SAME_START) for other in tried):
                 tried.append(pose)
                 tracks, solution = self._track_from(pose, images, seconds, refined)
                 if solution.reason:
