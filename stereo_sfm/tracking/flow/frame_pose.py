@@ -53,6 +53,7 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 # freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
 NEARER, WRONG_SIGMAS = 1.25, 2.0
 NO_PRIOR = np.full(6, np.inf)
+CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
 KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
@@ -254,7 +255,7 @@ class FramePoseSolver:
     def _confirmed(self, solution: PoseSolution, known: Bool, least: int) -> bool:
         """Whether most of the points known before (N,), and at least so many, agree with a pose."""
         agree = (solution.inlier & known).sum()
-        return bool(agree >= max(least, TRUSTED_SHARE * known.sum()))
+        return bool(agree >= max(least, CONFIRMED_SHARE * known.sum()))
 
     def _choose(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
