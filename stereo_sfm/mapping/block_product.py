@@ -11,10 +11,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from stereo_sfm.tracking.flow.windows import INDEX
-
-# Types of the compiler: six entries, six numbers of entries.
-ROW, FIRST = ir.VectorType(ir.DoubleType(), 6), ir.VectorType(ir.IntType(32), 6)
+# Types of the compiler: a number of an entry, six entries, six numbers of entries.
+INDEX, ROW, FIRST = ir.IntType(64), ir.VectorType(ir.DoubleType(), 6), ir.VectorType(ir.IntType(32), 6)
 
 
 @intrinsic

@@ -146,6 +146,15 @@ def test_nearly_equal_stamps_do_not_disturb() -> None:
     assert np.array_equal(shutter.velocity_sigma(), before)
 
 
+def test_equal_stamps_of_the_first_images_tell_no_velocity() -> None:
+    with open_source("sim:aisle?camera=pinhole&size=320x200&frames=4&readout=0.025") as source:
+        images, tracker = list(source), Tracker(load().tracker, source.rig)
+    images[1] = dataclasses.replace(images[1], stamp_ns=images[0].stamp_ns)
+    frames = [tracker.step(image)[0] for image in images]
+    assert [f.state for f in frames] == [TrackState.INITIALIZING, *[TrackState.OK] * 3]
+    assert all(np.isfinite(f.odom_T_cam).all() for f in frames)
+
+
 def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
     tracker = Tracker(load().tracker, rig)
     frames = [f for image in images if (f := tracker.step(image)[0]).state == TrackState.OK]

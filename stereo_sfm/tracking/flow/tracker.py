@@ -35,7 +35,7 @@ from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery, within
-from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.rolling_shutter import MIN_INTERVAL_S, RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -418,12 +418,10 @@ class Tracker:
         for _ in range(FIRST_ROUNDS):
             expected = self._predict(stamp_ns)
             solution = self._follow(images, expected)[1]
-            if solution.reason:
+            if solution.reason or expected.seconds < MIN_INTERVAL_S:
                 return np.zeros(6)
             self._velocity = se3.log(se3.inverse(self._pose) @ solution.pose) / expected.seconds
-            bearing = self._rig.left.unproject(self._tracks.uv)
-            rays = self._shutter.rays(self._pose, self._velocity, self._tracks.uv, bearing)
-            self._tracks.origin, self._tracks.direction = rays
+            self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
         return self._velocity
 
     def _bridge(self, stamp_ns: int) -> tuple[F64, F64] | None:
