@@ -152,9 +152,9 @@ class Tracker:
         long_lost = (image.stamp_ns - self._stamp_ns) * 1e-9 > FOLLOWED_S
         blind = self._loss.frames and long_lost and self._bridge(image.stamp_ns) is None
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
+        recovered = bool(self._loss.frames or solution.reason)
         if solution.reason:
             tracks, solution = self._search(image, images)
-        recovered = bool(self._loss.frames)
         if not (recovered or solution.reason) and (more := self._find_more(image, images, solution.pose)) is not None:
             (tracks, solution), recovered = more, True
         if solution.reason:
