@@ -300,6 +300,7 @@ class Keyframe(Message):
     inertial: InertialLink | None = None  # None: no IMU, or one that is left out
     wheels: MotionLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
     odometry: MotionLink | None = None  # by the images; None: no keyframe before in this submap
+    doubt: F64 = field(default_factory=lambda: np.zeros(2))  # (2,) m^2, rad^2: see `Keyframes.count_frame`
     right_turn: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) rad, of the right camera besides `rig_terms`
     right_turn_covariance: F64 = field(default_factory=lambda: np.zeros((3, 3)), metadata=shape(3, 3))  # of it
     samples: SensorSamples | None = None  # where the sensors are calibrated

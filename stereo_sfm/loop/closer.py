@@ -53,6 +53,7 @@ GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a ga
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
 # Largest difference of two keyframes' estimates of one loop: noise of both, and drift between them.
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0
+DOUBT_SIGMAS = 3.0  # of odometry in doubt that a loop may contradict: noise does in one of 400
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class LoopCloser:
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):  # the tracker's rig was corrected
             self._rig_terms = keyframe.rig_terms
             self._rig = with_terms(self._source_rig, self._rig_terms)
-        self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns)
+        self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns, keyframe.doubt)
         with self._spans.span("loop_words"):
             bag, side_bag = (self._vocabulary.bag(c.descriptors) for c in (keyframe.corners, keyframe.sides))
         self._fronts.add(keyframe)
@@ -336,8 +337,9 @@ class LoopCloser:
         kf_id, candidate, votes, share = keyframe.kf_id, of.kf_id, self._config.consistent, verdict.share
         path, anywhere = self._graph.path(candidate, kf_id), False
         if path is not None:
-            metres = config.gate_m + config.gate_m_per_m * path.metres
-            degrees = config.gate_deg + config.gate_deg_per_m * path.metres
+            doubt_m, doubt_deg = DOUBT_SIGMAS * path.sigmas * [1.0, 180.0 / math.pi]
+            metres = config.gate_m + config.gate_m_per_m * path.metres + doubt_m
+            degrees = config.gate_deg + config.gate_deg_per_m * path.metres + doubt_deg
             near = within(se3.inverse(path.a_T_b) @ candidate_T_kf, metres, degrees)
             against = "" if near else "against_odometry"
         else:

@@ -32,6 +32,7 @@ class GraphPath:
 
     a_T_b: F64  # (4, 4) composed along the path
     metres: float  # of odometry on it, to which its drift is proportional
+    sigmas: F64  # (2,) metres, radians: of odometry on it that is in doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,7 @@ class _Nodes(Columns):
     anchored: F64 = column(np.float64, np.eye(4), (4, 4))  # corrected at each loop to the pose of its older end
     frame: I64 = column(np.int64, 0)  # the submap whose frame `anchored` is in
     distance: F64 = column(np.float64, 0.0)  # metres since the start
+    doubt: F64 = column(np.float64, 0.0, (2,))  # m^2, rad^2 since the start
     kept: Bool = column(np.bool_, True)  # False: no longer a candidate
 
 
@@ -76,18 +78,24 @@ class KeyframeGraph:
     def _row(self, kf_id: int) -> int:
         return int(np.searchsorted(self._nodes.kf_id, kf_id))
 
-    def add(self, kf_id: int, odom_T_cam: F64, submap: int, stamp_ns: int = 0) -> None:
-        """Append the newest keyframe; `submap` numbers the uninterrupted part of the odometry it belongs to."""
+    def add(self, kf_id: int, odom_T_cam: F64, submap: int, stamp_ns: int = 0, doubt: F64 | float = 0.0) -> None:
+        """Append the newest keyframe.
+
+        Args:
+            submap: number of the uninterrupted part of the odometry it belongs to. doubt: (2,) m^2, rad^2, see
+                `Keyframe.doubt`.
+        """
         anchored, frame, distance = odom_T_cam, submap, 0.0
         if len(self._nodes):
             last = self._nodes.odom_T_cam[-1]
+            doubt = self._nodes.doubt[-1] + doubt
             distance = float(self._nodes.distance[-1] + np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
             if self._nodes.submap[-1] == submap:
                 anchored, frame = self._nodes.anchored[-1] @ se3.inverse(last) @ odom_T_cam, self._nodes.frame[-1]
         self._joined.setdefault(submap, submap)
         self._nodes.append(
             1, kf_id=kf_id, stamp_ns=stamp_ns, submap=submap, odom_T_cam=odom_T_cam, anchored=anchored, frame=frame,
-            distance=distance,
+            distance=distance, doubt=doubt,
         )  # fmt: skip
 
     def exclude(self, kf_id: int) -> None:
@@ -224,14 +232,15 @@ class KeyframeGraph:
         path = _shortest_path(ends, metres, len(rows), start, goal)
         if path is None:
             return None
-        a_T_b, total = np.eye(4), 0.0
+        a_T_b, total, doubt = np.eye(4), 0.0, np.zeros(2)
         for k, forward in path:
             p, q = rows[ends[k]]
             odometry = se3.inverse(nodes.odom_T_cam[p]) @ nodes.odom_T_cam[q] if k < len(linked) else None
             p_T_q = self._loops.a_T_b[k - len(linked)] if odometry is None else odometry
             a_T_b = a_T_b @ (p_T_q if forward else se3.inverse(p_T_q))
             total += float(metres[k])
-        return GraphPath(a_T_b, total)
+            doubt += nodes.doubt[q] - nodes.doubt[p] if k < len(linked) else 0.0
+        return GraphPath(a_T_b, total, np.sqrt(doubt))
 
 
 def _newest_between(a: I64, b: I64) -> Bool:

@@ -202,17 +202,18 @@ def _strain(poses: F64, closed: Edges) -> float:
 
 def odometry_edges(map_: Map, poses: F64) -> Edges:
     """Edges between consecutive keyframes and between those that share many points (the covisibility graph)."""
-    alive = map_.keyframes.alive
+    alive, doubt = map_.keyframes.alive, map_.keyframes.doubt
     pairs: set[tuple[int, int]] = set()
     for row in map_.living_keyframes().tolist():
         previous = int(map_.keyframes.previous[row])
         if previous >= 0 and alive[previous]:
             pairs.add((previous, row))
         for other in map_.neighbours(row, COVISIBLE_POINTS)[0].tolist():
-            if alive[other]:
+            if alive[other] and (doubt[other] == doubt[row]).all():  # else the points err as the odometry does
                 pairs.add((min(row, other), max(row, other)))
     table = np.array(sorted(pairs), np.int64).reshape(-1, 2)
-    return edges_of_poses(poses, table[:, 0], table[:, 1], *ODOMETRY)
+    edges = edges_of_poses(poses, table[:, 0], table[:, 1], *ODOMETRY)
+    return dataclasses.replace(edges, sigmas=np.sqrt(edges.sigmas**2 + np.abs(doubt[edges.j] - doubt[edges.i])))
 
 
 def _with_drift(odometry: Edges, poses: F64, a: int, b: int) -> Edges:

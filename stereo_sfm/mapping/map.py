@@ -153,6 +153,7 @@ class Map:
             previous=row - 1 if same else -1,
             down=keyframe.down,
             down_sigma=keyframe.down_sigma,
+            doubt=keyframe.doubt + (self.keyframes.doubt[row - 1] if row else 0.0),
             state=0.0 if keyframe.inertial is None else np.delete(keyframe.inertial.state, np.s_[3:6]),  # no gravity
             obs_first=len(self.observations),
         )

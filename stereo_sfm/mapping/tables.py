@@ -24,6 +24,7 @@ class KeyframeTable(Columns):
     down: F64 = column(np.float64, 0.0, (3,))  # (K, 3) gravity's direction in the camera, zero: unknown
     down_sigma: F64 = column(np.float64, 0.0)  # radians, 0: unknown
     state: F64 = column(np.float64, 0.0, (9,))  # (K, 9) m/s in the IMU's axes, biases: m/s^2 and rad/s
+    doubt: F64 = column(np.float64, 0.0, (2,))  # (K, 2) m^2, rad^2, of the odometry since the first keyframe
     alive: Bool = column(np.bool_, True)
     named: Bool = column(np.bool_, True)  # whether loops may still name it
 

@@ -123,6 +123,21 @@ def test_a_twin_contradicted_by_odometry_does_not_make_the_true_place_ambiguous(
     assert results[29].candidate_kf_id == 4 and results[29].rejected == ((10, 0.5, "against_odometry"),)
 
 
+def test_a_loop_may_contradict_odometry_that_is_in_doubt(
+    vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five metres off: the pose may have followed somebody before keyframe 20."""
+    sequence = make_sequence([0], seed=3)
+    script = {(k, c): 60 for k in (28, 29) for c in (9, 10)}
+    doubt = np.array([2.0**2, 0.0])
+    keyframes = [dataclasses.replace(k, doubt=doubt) if k.kf_id == 20 else k for k in sequence.keyframes]
+    refused = answers_of(sequence, vocabulary, monkeypatch, script, wrong={9, 10})
+    accepted = answers_of(sequence, vocabulary, monkeypatch, script, wrong={9, 10}, keyframes=keyframes)
+    assert all(reason == "against_odometry" for r in refused[28:30] for _, _, reason in r.rejected)
+    assert [r.candidate_kf_id for r in refused[28:30]] == [-1, -1]
+    assert accepted[29].candidate_kf_id in (9, 10)
+
+
 def test_two_places_without_a_path_between_them_are_ambiguous(
     vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
 ) -> None:

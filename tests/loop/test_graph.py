@@ -24,6 +24,16 @@ def test_a_path_without_loops_is_the_odometry_and_its_length() -> None:
     np.testing.assert_allclose(path.a_T_b, at(2.5), atol=1e-12)
 
 
+def test_a_path_over_odometry_in_doubt_is_as_uncertain() -> None:
+    graph = KeyframeGraph()
+    for k, metres in enumerate((0.0, 0.3, 0.4, 0.0)):
+        graph.add(k, at(float(k)), 0, doubt=np.array([metres**2, 0.0]))
+    for ends, sigma in (((0, 2), 0.5), ((3, 1), 0.4), ((2, 3), 0.0)):
+        path = graph.path(*ends)
+        assert path is not None
+        np.testing.assert_allclose(path.sigmas, [sigma, 0.0], atol=1e-12)
+
+
 def test_a_loop_shortens_the_path() -> None:
     graph = KeyframeGraph()
     for k in range(20):

@@ -134,6 +134,25 @@ def test_a_loop_that_no_drift_explains_is_refused() -> None:
     assert np.array_equal(map_.keyframes.map_T_kf, poses)
 
 
+def test_odometry_in_doubt_takes_the_error_of_a_loop(sequence: StoreSequence) -> None:
+    """Without other errors, the pose followed somebody by half a metre before keyframe 60."""
+    a, b = ends(sequence)
+    truth, followed = sequence.world_T_kf, se3.exp(np.array([0.4, 0.0, 0.3, 0, 0, 0]))
+
+    def error_after_loop(doubt: F64) -> float:
+        keyframes = [
+            dataclasses.replace(k, odom_T_cam=followed @ pose, doubt=doubt * (k.kf_id == 60))
+            if k.kf_id >= 60
+            else dataclasses.replace(k, odom_T_cam=pose)
+            for k, pose in zip(sequence.keyframes, truth, strict=True)
+        ]
+        map_ = raw_map(dataclasses.replace(sequence, keyframes=keyframes))
+        assert apply_loop(map_, true_loop(sequence, a, b), [], LoopConfig()).applied
+        return trajectory_error(map_, truth)
+
+    assert error_after_loop(np.array([0.5**2, 0.01**2])) < 0.2 * error_after_loop(np.zeros(2))
+
+
 def test_false_loop_changes_nothing(sequence: StoreSequence) -> None:
     map_ = raw_map(sequence)
     a, b = ends(sequence)

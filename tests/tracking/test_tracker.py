@@ -19,7 +19,11 @@ from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.flow.tracker import Tracker
+from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.klt import StereoPyramids
+from stereo_sfm.tracking.flow.motion_prior import SPREAD
+from stereo_sfm.tracking.flow.tracker import NOT_FOUND, Tracker
+from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import Frame, StereoImage, TrackState, Trajectory
 from tests.synthetic import pinhole_rig
 
@@ -174,6 +178,30 @@ def test_a_long_loss_of_tracking_starts_a_submap(data_root: Path) -> None:
     assert next(k.submap_id for _, k in answers if k is not None and k.frame_id >= 35) >= 1
     steps = np.linalg.norm(np.diff([f.odom_T_cam[:3, 3] for f, _ in answers], axis=0), axis=1)
     assert steps.max() < 0.2  # the odometry pose never jumps
+
+
+def test_a_pose_that_was_searched_for_tells_no_velocity(data_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may jump, and the next images would be looked for farther along; the link to it is in doubt."""
+    jump = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    with open_source(data_root / "euroc_mh01") as source:
+        images = list(islice(source, 24))
+        tracker = Tracker(CONFIG, source.rig)
+    for image in images[:20]:
+        tracker.step(image)
+    before = tracker._velocity.copy()
+    follow = tracker._follow
+
+    def jumped(image: StereoImage, pyramids: StereoPyramids) -> tuple[Tracks, PoseSolution]:
+        tracks, solution = follow(pyramids, tracker._predict(image.stamp_ns))
+        return tracks, dataclasses.replace(solution, pose=solution.pose @ jump)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tracker, "_follow", lambda *_: NOT_FOUND)
+        patch.setattr(tracker, "_search", jumped)
+        frame, keyframe = tracker.step(images[20])
+    assert frame.state == TrackState.RECOVERED
+    assert np.linalg.norm(tracker._velocity[:3] - before[:3]) < 0.5  # not 0.1 m in 1/20 s
+    assert keyframe is not None and keyframe.doubt[0] == pytest.approx((SPREAD[0] / 20) ** 2, rel=0.01)
 
 
 def test_covariance_grows_where_little_is_seen(data_root: Path) -> None:

@@ -14,6 +14,7 @@ from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.flow.consensus import Movers, without_moving
 from stereo_sfm.tracking.flow.klt import StereoPyramids
+from stereo_sfm.tracking.flow.motion_prior import SPREAD
 from stereo_sfm.tracking.flow.place_corners import SCALE, PlaceCorners
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
@@ -66,6 +67,7 @@ class Keyframes:
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
         self._covariance: F64 = np.zeros((6, 6))  # of it
         self._frames_since = 0
+        self._doubt: F64 = np.zeros(2)  # since the newest keyframe
         self._stamp_ns, self._submap_id = 0, -1  # of the newest keyframe
         self._first_of_rig = 0  # id of the first keyframe of the current rig
 
@@ -77,9 +79,14 @@ class Keyframes:
         if self._side_views is not None:
             self._side_views.use(rig)
 
-    def count_frame(self) -> None:
-        """A frame was tracked since the newest keyframe."""
+    def count_frame(self, doubtful_s: float) -> None:
+        """A frame was tracked since the newest keyframe.
+
+        `doubtful_s`: seconds since the frame before, if most of what was followed contradicts the pose: it may be
+        anybody's who moves, or a place that looks alike. Then the robot may have moved as robots do.
+        """
         self._frames_since += 1
+        self._doubt = self._doubt + np.square(SPREAD * doubtful_s)
 
     def due(self, tracks: Tracks) -> bool:
         """Whether the frame should become a keyframe: few of the newest one's static points are left, or the rig was
@@ -122,10 +129,11 @@ class Keyframes:
             rig_terms=rig_terms.copy(),
             **({} if sudden is None else {"right_turn": sudden.turn, "right_turn_covariance": sudden.covariance}),
             odometry=self._moved(odom_T_cam, covariance) if submap_id == self._submap_id else None,
+            doubt=self._doubt,
             **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )
         self._stamp_ns, self._submap_id = image.stamp_ns, submap_id
-        self.count, self._frames_since = self.count + 1, 0
+        self.count, self._frames_since, self._doubt = self.count + 1, 0, np.zeros(2)
         self._pose, self._covariance = odom_T_cam.copy(), covariance.copy()
         return keyframe
 

@@ -359,7 +359,7 @@ class Tracker:
         self._continue(image, images, solution.pose, tracks)
         if self._sensors is not None:
             self._sensors.accept(image.stamp_ns, solution.pose)
-        self._keyframes.count_frame()
+        self._keyframes.count_frame(seconds if recovered or 2 * np.count_nonzero(inlier) < len(inlier) else 0.0)
         return inlier[kept]
 
     def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
