@@ -8,31 +8,58 @@ import subprocess
 import sys
 import time
 from collections import deque
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _dense_open3d import beside
 from _figures import commit
 from _verdicts import Verdicts
 from scipy.spatial import cKDTree
 
-from stereo_sfm.dense.build import read_depth
+from stereo_sfm.dense.build import CubeIndex, read_depth
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import find_input, keyframes
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, partner, shows_more
+from stereo_sfm.dense.surface import extract
 from stereo_sfm.dense.views import stereo_view
+from stereo_sfm.dense.volume import Seen, contributes, fuse, touched
 from stereo_sfm.drivers.sim.kernels import FACING
 from stereo_sfm.drivers.sim.render import Renderer
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
+from stereo_sfm.maps.floor import find_floor
 from stereo_sfm.types import F64, Bool
 
 NEAR_M, CLOSE_M = 2.5, 0.05  # what is measured; of the F-score and of covered surface
 SAME_GREY = 10  # levels
 
 
-def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays: int) -> None:
-    """One drive to a mesh, by the commands a user has; the seed follows from the commit, so that nobody chose it."""
+@dataclass(frozen=True)
+class Truth:
+    """What a drive's keyframes saw, a point a centimetre, in the world's frame."""
+
+    points: F64  # (N, 3) metres
+    normals: F64  # (N, 3)
+    fronts: Bool  # (N,) of shelves, seen from within `NEAR_M`
+
+    def score(self, mesh: F64) -> tuple[float, float, float]:
+        """Covered share of fronts, median distance of a mesh's vertices (V, 3) from the surface (m), F-score."""
+        away, nearest = cKDTree(self.points).query(mesh)
+        plane = np.abs(((mesh - self.points[nearest]) * self.normals[nearest]).sum(1))
+        complete = float((cKDTree(mesh).query(self.points[self.fronts])[0] < CLOSE_M).mean())
+        right = float((away < CLOSE_M).mean())
+        return complete, float(np.median(plane)), 2 * right * complete / (right + complete)
+
+
+def simulated(
+    verdicts: Verdicts, folder: Path, camera: str, metres: float, rays: int, open3d: Path | None = None
+) -> None:
+    """One drive to a mesh, by the commands a user has; the seed follows from the commit, so that nobody chose it.
+
+    `open3d`: the interpreter that has it; a pinhole drive's depth images are fused by it as well.
+    """
     seed = int(hashlib.sha256(f"{commit().rstrip('+')} {camera}".encode()).hexdigest()[:7], 16)
     spec = f"sim:loop?camera={camera}&rays={rays}&seed={seed}&length={metres:g}&rate=15"
     run = folder / f"{camera}_{seed}_{metres:g}_{rays}"
@@ -41,7 +68,8 @@ def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays
     began, used = time.perf_counter(), _processor_time()
     peak = _call("dense", str(run), "-o", str(run / "surface"), "-q")
     took, used = time.perf_counter() - began, _processor_time() - used
-    errors, mesh = _compared(spec, run)
+    errors, truth, truth_T_floor = _compared(spec, run)
+    mesh = truth.score(se3.transform(truth_T_floor, _vertices(run / "surface" / "cloud.ply")))
     name = f"{camera}, {metres:g} m, seed {seed}"
     middle, most = 100 * np.quantile(errors, [0.5, 0.9])
     verdicts.row(f"{name}: depth of fronts, median at most 1 %", middle <= 1, f"{middle:.2f} %")
@@ -52,6 +80,46 @@ def simulated(verdicts: Verdicts, folder: Path, camera: str, metres: float, rays
     verdicts.row(f"{name}: F-score at 5 cm at least 0.9", score >= 0.9, f"{score:.3f}")
     verdicts.row(f"{name}: map to mesh in at most 180 s", took <= 180, f"{took:.0f} s, {used:.0f} s of processor time")
     verdicts.row(f"{name}: at most 2 GB a process", peak <= 2, f"{peak:.2f} GB")
+    if open3d is not None and camera == "pinhole":
+        _beside_open3d(verdicts, name, run, peak, (truth, truth_T_floor), open3d)
+
+
+def _beside_open3d(
+    verdicts: Verdicts, name: str, run: Path, peak: float, given: tuple[Truth, F64], python: Path
+) -> None:
+    """Fusion alone, both from the depth images of the run, in one process and one thread.
+
+    Args:
+        peak: GB of the largest process of the whole command. given: the truth, and the pose of the floor in it.
+    """
+    truth, truth_T_floor = given
+    saved, voxel = find_input(run).saved, 0.02
+    floor_T_map = se3.inverse(find_floor(saved.snapshot))
+    seen = [
+        Seen(depth, floor_T_map @ saved.snapshot.map_T_kf[int(path.stem)], 0)
+        for path in sorted((run / "surface" / "depth").glob("*.npz"))
+        if (depth := read_depth(path)) is not None
+    ]
+    other = beside(python, seen, voxel, run)
+    places, reach = np.stack([s.floor_T_cam[:3, 3] for s in seen]), np.array([s.reach(voxel) for s in seen])
+    fuse((0, 0, 0), seen[:1], voxel)  # compiles
+    began, points = time.process_time(), list[F64]()
+    for cube in sorted(set[CubeIndex]().union(*(touched(s, voxel) for s in seen))):
+        near = [seen[i] for i in np.flatnonzero(contributes(places, reach, cube, voxel))]
+        points.append(extract(fuse(cube, near, voxel)).vertices.astype(float) * voxel)
+    used = time.process_time() - began
+    ours, theirs = (
+        truth.score(se3.transform(truth_T_floor, p.astype(float))) for p in (np.concatenate(points), other["vertices"])
+    )
+    for what, k, text in (("distance of the mesh", 1, "{:.4f} m"), ("F-score", 2, "{:.3f}")):
+        holds = ours[k] <= theirs[k] if k == 1 else ours[k] >= theirs[k]
+        verdicts.row(
+            f"{name}: {what} as good as by Open3D", holds, f"{text.format(ours[k])} and {text.format(theirs[k])}"
+        )
+    peaks = [float(other[key]) for key in ("seconds", "gigabytes")]
+    verdicts.row(f"{name}: fusion as fast as Open3D's", used <= peaks[0], f"{used:.1f} s and {peaks[0]:.1f} s")
+    text = f"Open3D {peaks[1]:.2f} GB for the fusion alone"
+    verdicts.row(f"{name}: memory of a process at most Open3D's", peak <= peaks[1], text)
 
 
 def _call(*args: str) -> float:
@@ -66,8 +134,8 @@ def _processor_time() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _compared(spec: str, run: Path) -> tuple[F64, tuple[float, float, float]]:
-    """Relative errors of depths of fronts; covered share of fronts, median distance of the mesh (m), F-score."""
+def _compared(spec: str, run: Path) -> tuple[F64, Truth, F64]:
+    """Relative errors of depths of fronts; what there was to see; pose (4, 4) of the run's floor in that frame."""
     saved = find_input(run).saved
     source: Any = open_source(spec)
     renderer, frames = Renderer(source.world, source.rig), saved.snapshot.frame_ids
@@ -90,12 +158,8 @@ def _compared(spec: str, run: Path) -> tuple[F64, tuple[float, float, float]]:
         fronts.append(front[some][good])
     every, which, cells = _thinned(np.concatenate(points))
     near = np.bincount(cells, np.concatenate(fronts)) > 0  # by a keyframe, whatever others see there from afar
-    mesh = se3.transform(truth_T_map @ _map_T_floor(run), _vertices(run / "surface" / "cloud.ply"))
-    away, nearest = cKDTree(every).query(mesh)
-    plane = np.abs(((mesh - every[nearest]) * np.concatenate(normals)[which][nearest]).sum(1))
-    found = cKDTree(mesh).query(every[near])[0] < CLOSE_M
-    right, complete = float((away < CLOSE_M).mean()), float(found.mean())
-    return np.concatenate(errors), (complete, float(np.median(plane)), 2 * right * complete / (right + complete))
+    truth = Truth(every, np.concatenate(normals)[which], near)
+    return np.concatenate(errors), truth, truth_T_map @ _map_T_floor(run)
 
 
 def _range_errors(depth: DepthImage, camera: Any, ranges: Any, front: Bool) -> F64:
