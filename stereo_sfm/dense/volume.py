@@ -27,7 +27,7 @@ SIDE = 64  # voxels
 APRON = 1  # voxels around a cube, from which its surface at the border follows
 TRUNCATION = 4  # voxels before and behind a surface
 SESSIONS = 3  # newest ones that count
-TILE = 16  # px, of the coarse image of largest ranges
+TILE = 8  # px, of the coarse image of largest ranges
 BLOCK = 11  # voxels a side that are left out or projected together; 66 is a multiple
 BENT_PX = 2.0  # second differences of projections over a block: up to here parabolas are right to a tenth of a pixel
 
@@ -102,18 +102,18 @@ def _add(sums: list[F32], seen: Seen, corner: F64, voxel: float) -> None:
     view_T_floor = se3.inverse(seen.floor_T_cam @ se3.from_rotation_translation(depth.cam_R_view, np.zeros(3)))
     camera = depth.camera
     _integrate(
-        sums[0], sums[1], sums[2], sums[3], depth.ranges, depth.sigmas, depth.grey, _farthest_of_tiles(depth),
+        sums[0], sums[1], sums[2], sums[3], depth.ranges, depth.sigmas, depth.grey, _farthest_of_tiles(depth, voxel),
         camera.model_id, camera.params, view_T_floor[:3, :3].copy(), view_T_floor[:3, 3].copy(), corner, voxel,
     )  # fmt: skip
 
 
 @lru_cache(64)
-def _farthest_of_tiles(depth: DepthImage) -> F32:
-    """Largest range of each tile, 0 where there is none."""
+def _farthest_of_tiles(depth: DepthImage, voxel: float) -> F32:
+    """Largest range of each tile that is used, 0 where there is none."""
     height, width = depth.ranges.shape
     h, w = -(-height // TILE), -(-width // TILE)
     padded = np.zeros((h * TILE, w * TILE), np.float32)
-    padded[:height, :width] = np.nan_to_num(depth.ranges)
+    padded[:height, :width] = np.where(depth.sigmas <= TRUNCATION * voxel, depth.ranges, 0)
     return padded.reshape(h, TILE, w, TILE).max(axis=(1, 3))
 
 
