@@ -20,7 +20,7 @@ import numpy as np
 
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import PINHOLE, inner, njit, project_one
 from stereo_sfm.types import F32, F64, I64, Bool, ReadOnly
 
 SIDE = 64  # voxels
@@ -186,7 +186,11 @@ def _integrate(distance, weight, views, grey, ranges, sigmas, image, tiles, mode
                     if not near <= _farthest(tiles, u - TILE, u + TILE, v - TILE, v + TILE) + cut:
                         continue  # outside the view, behind everything around, or nothing was measured
                 even = _project_block(model, params, x0, y0, z0, step, us, vs)
-                if even and near > _farthest(tiles, us.min() - 2, us.max() + 2, vs.min() - 2, vs.max() + 2) + cut:
+                ahead = np.isfinite(us).sum()
+                if ahead == 0:
+                    continue
+                hull = even or (model == PINHOLE and ahead == us.size)  # straight lines stay straight
+                if hull and near > _farthest(tiles, us.min() - 2, us.max() + 2, vs.min() - 2, vs.max() + 2) + cut:
                     continue
                 for i in range(BLOCK):
                     for j in range(BLOCK):
