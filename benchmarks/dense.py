@@ -59,6 +59,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=PAIRS, help="of store_pairs, evenly spread (default: all 24)")
     parser.add_argument("--metres", type=float, default=40.0, help="of a rendered drive")
     parser.add_argument("--rays", type=int, default=4, help="squared, a pixel of a rendered drive")
+    parser.add_argument("--open3d", type=Path, metavar="PYTHON", help="an interpreter that has it, for comparison")
     parser.add_argument("--keyframes", type=int, default=40, help="of a real drive")
     parser.add_argument("--keep", type=Path, help="folder of runs, and of the rows of parts that ended")
     parser.add_argument("--write", action="store_true", help="replace the benchmark's figures")
@@ -88,7 +89,7 @@ def main() -> None:
             elif part in REAL:
                 real(verdicts, folder, part, str(place), options.keyframes, sgbm)
             else:
-                simulated(verdicts, folder, part, options.metres, options.rays)
+                simulated(verdicts, folder, part, options.metres, options.rays, options.open3d)
             verdicts.keep()
         if options.write:
             print(verdicts.write(PARTS, "dense", "Depth, surfaces, obstacles"), file=sys.stderr)

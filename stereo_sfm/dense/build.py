@@ -34,7 +34,7 @@ from stereo_sfm.types import F64, U8, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "5"  # of the files: grows when the same input gives other bits
+VERSION = "6"  # of the files: grows when the same input gives other bits
 CubeIndex = tuple[int, int, int]
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)

@@ -25,6 +25,7 @@ SAME_SURFACE = 1.5  # px of disparity from the middle's within which a pixel tak
 FLAT_PX2 = 0.3  # added to the spread of x and of y (a window's: 6.7), so that few values in a row give no slope across
 UNKNOWN_WEIGHT = 0.05  # of pixels without disparity: mostly occluded, but they may be all that there is
 ITERATIONS = 6
+ENOUGH_PX = 0.05  # change after which the next one is within the noise
 FITS = 3  # of a plane, reweighed: the first one's weights are those of a flat one, so that a step makes no slope
 FARTHEST = 1.5  # px from the start: beyond, another match was found
 LEAST_GRADIENT = 0.03  # grey levels a pixel, root mean square in a window: below, rounding decides
@@ -79,8 +80,8 @@ def _slopes(disparity, u, v):
     middle = disparity[v, u]
     for _ in range(FITS):
         sums = NO_VALUES
-        for dy in range(-RADIUS, RADIUS + 1):
-            for dx in range(-RADIUS, RADIUS + 1):
+        for dy in range(-RADIUS, RADIUS + 1, 2):  # every other one tells as much of a plane
+            for dx in range(-RADIUS, RADIUS + 1, 2):
                 q = disparity[v + dy, u + dx] - middle
                 if not abs(q) <= SAME_SURFACE:
                     continue
@@ -98,7 +99,6 @@ def _refine(left, right, disparity, near, like, step):
     sigma = out.copy()
     size = (2 * RADIUS + 1) ** 2
     weight, grey, rows, shift = np.empty(size), np.empty(size), np.empty(size, np.int64), np.empty(size)
-    other, slope = np.empty(size), np.empty(size)
     held = (GREY_NOISE / MATCH_PX) ** 2
     for v in range(-(-RADIUS // step) * step, h - RADIUS, step):
         for u in range(-(-RADIUS // step) * step, w - RADIUS, step):
@@ -122,43 +122,44 @@ def _refine(left, right, disparity, near, like, step):
             found, done = float(start), False
             gain = squares = spread = total = 0.0
             for _ in range(ITERATIONS):
-                total = mean = mean_other = mean_slope = 0.0
+                total = ws = wt = wss = wst = wtt = vv = vs = vss = 0.0  # of weights, slopes, differences
                 for k in range(count):
                     x = shift[k] - found
                     j = int(math.floor(x))
                     if j < 1 or j + 2 >= w:
-                        weight[k] = other[k] = slope[k] = 0.0
+                        weight[k] = 0.0
                         continue
                     f = x - j
                     p0, p1 = float(right[rows[k], j - 1]), float(right[rows[k], j])
                     p2, p3 = float(right[rows[k], j + 1]), float(right[rows[k], j + 2])
                     c1, c2, c3 = p2 - p0, 2 * p0 - 5 * p1 + 4 * p2 - p3, 3 * (p1 - p2) + p3 - p0  # Catmull-Rom
-                    other[k] = p1 + 0.5 * f * (c1 + f * (c2 + f * c3))
-                    slope[k] = 0.5 * c1 + f * (c2 + 1.5 * f * c3)
-                    total += weight[k]
-                    mean += weight[k] * grey[k]
-                    mean_other += weight[k] * other[k]
-                    mean_slope += weight[k] * slope[k]
+                    t = grey[k] - (p1 + 0.5 * f * (c1 + f * (c2 + f * c3)))
+                    s = 0.5 * c1 + f * (c2 + 1.5 * f * c3)
+                    m = weight[k]
+                    ms, mt, mm = m * s, m * t, m * m
+                    total += m
+                    ws += ms
+                    wt += mt
+                    wss += ms * s
+                    wst += ms * t
+                    wtt += mt * t
+                    vv += mm
+                    vs += mm * s
+                    vss += ms * ms
                 if total < 1e-6:
                     break
-                mean, mean_other, mean_slope = mean / total, mean_other / total, mean_slope / total
-                gain = pull = squares = spread = 0.0
-                for k in range(count):
-                    g, e = slope[k] - mean_slope, grey[k] - mean - other[k] + mean_other
-                    wg = weight[k] * g
-                    gain += wg * g
-                    pull += wg * e
-                    squares += weight[k] * e * e
-                    spread += wg * wg
+                mean = ws / total
+                gain, pull = wss - mean * ws, wst - mean * wt
+                spread = max(vss - 2 * mean * vs + mean * mean * vv, 0.0)
                 if gain < LEAST_GRADIENT * LEAST_GRADIENT * total:
                     break
                 change = min(max(-pull / (gain + held * total), -0.5), 0.5)
                 found += change
                 if abs(found - start) > FARTHEST:
                     break
-                squares /= total
+                squares = max(wtt - wt * wt / total, 0.0) / total
                 done = True
-                if abs(change) < 0.01:
+                if abs(change) < ENOUGH_PX:
                     break
             if done and gain >= LEAST_GRADIENT * LEAST_GRADIENT * total and abs(found - start) <= FARTHEST:
                 out[v // step, u // step] = found

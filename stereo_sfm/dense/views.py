@@ -18,11 +18,12 @@ from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.cameras import Camera, Epipolar, Pinhole
 from stereo_sfm.geometry.rectify import remap_tables
-from stereo_sfm.types import F32, F64, U8, Bool
+from stereo_sfm.types import F32, F64, I64, U8, Bool
 
 WIDE_DEG = 120.0  # a pinhole image of a wider view is mostly stretched border (as geometry/rectify.py)
 POLE_DEG = 75.0  # from the plane across the baseline: beyond, the baseline seen from there is below a quarter of itself
 NEAREST_BASELINES = 4.0  # nearest range searched in a stereo pair, as `tracker.min_depth_baselines`
+COARSE_PX = 8  # between the pixels of a view that tell which part of it two images show
 NEAREST_M = 0.5  # the same between keyframes: a robot keeps this distance from shelves
 
 
@@ -129,24 +130,22 @@ def motion_view(first: Camera, second: Camera, first_T_second: F64, focal: float
     half = np.deg2rad(POLE_DEG)
     width, height = int(2 * half * focal), int(2 * np.pi * focal)
     camera = Epipolar(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
-    parts = [
-        _resampling(first, camera, view_R_first),
-        _resampling(second, camera, view_R_first @ first_T_second[:3, :3]),
-    ]
-    rows = np.flatnonzero((parts[0].mask & parts[1].mask).any(axis=1)).tolist()
-    columns = np.flatnonzero((parts[0].mask | parts[1].mask).any(axis=0)).tolist()
-    if len(rows) < 16 or len(columns) < 16:
+    sources = (first, view_R_first), (second, view_R_first @ first_T_second[:3, :3])
+    some = camera.bearing_grid(COARSE_PX)
+    masks = [source.inside(source.project(some @ rotation)) for source, rotation in sources]
+    v = _span(np.flatnonzero((masks[0] & masks[1]).any(axis=1)), height)
+    u = _span(np.flatnonzero((masks[0] | masks[1]).any(axis=0)), width)
+    cropped = Epipolar(u.stop - u.start, v.stop - v.start, focal, focal, camera.cx - u.start, camera.cy - v.start)
+    if min(cropped.size) < 16:
         return None
-    cut = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    cropped = Epipolar(
-        cut[1].stop - cut[1].start, cut[0].stop - cut[0].start, focal, focal,
-        camera.cx - cut[1].start, camera.cy - cut[0].start,
-    )  # fmt: skip
-    parts = [
-        _Resampling(np.ascontiguousarray(p.table[cut]), np.ascontiguousarray(p.fraction[cut]), p.mask[cut])
-        for p in parts
-    ]
+    parts = [_resampling(source, cropped, rotation) for source, rotation in sources]
     return PairView(cropped, view_R_first.T, baseline, NEAREST_M, parts[0], parts[1])
+
+
+def _span(seen: I64, size: int) -> slice:
+    """Pixels of `size` around those that are seen. Args: seen (N,) numbers among every `COARSE_PX`-th, ascending."""
+    at = (COARSE_PX * seen).tolist()
+    return slice(max(0, at[0] - COARSE_PX), min(size, at[-1] + COARSE_PX + 1)) if at else slice(0, 0)
 
 
 def scaled(camera: Camera, scale: float) -> Camera:

@@ -14,20 +14,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import PINHOLE, inner, njit, project_one
 from stereo_sfm.types import F32, F64, I64, Bool, ReadOnly
 
 SIDE = 64  # voxels
 APRON = 1  # voxels around a cube, from which its surface at the border follows
 TRUNCATION = 4  # voxels before and behind a surface
 SESSIONS = 3  # newest ones that count
-TILE = 16  # px, of the coarse image of largest ranges
-BLOCK = 11  # voxels a side that are left out together; 66 is a multiple
+TILE = 8  # px, of the coarse image of largest ranges
+BLOCK = 11  # voxels a side that are left out or projected together; 66 is a multiple
+BENT_PX = 2.0  # second differences of projections over a block: up to here parabolas are right to a tenth of a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +64,10 @@ def touched(seen: Seen, voxel: float) -> set[tuple[int, int, int]]:
     """The cubes in which a depth image has surfaces."""
     points = seen.depth.points()[seen.used(voxel)].astype(np.float64)
     at = np.floor(se3.transform(seen.floor_T_cam, points) / (SIDE * voxel)).astype(np.int64)
-    return {(int(x), int(y), int(z)) for x, y, z in np.unique(at, axis=0)}
+    low = at.min(axis=0, initial=0)
+    shape = (at.max(axis=0, initial=0) - low + 1).tolist()
+    cubes = np.unravel_index(np.unique(np.ravel_multi_index((at - low).T, shape)), shape)
+    return set(map(tuple, (np.stack(cubes, axis=1) + low).tolist()))
 
 
 def contributes(seen_from: F64, reach: F64, index: tuple[int, int, int], voxel: float) -> Bool:
@@ -97,54 +102,117 @@ def _add(sums: list[F32], seen: Seen, corner: F64, voxel: float) -> None:
     view_T_floor = se3.inverse(seen.floor_T_cam @ se3.from_rotation_translation(depth.cam_R_view, np.zeros(3)))
     camera = depth.camera
     _integrate(
-        sums[0], sums[1], sums[2], sums[3], depth.ranges, depth.sigmas, depth.grey, _coarse(depth.ranges),
+        sums[0], sums[1], sums[2], sums[3], depth.ranges, depth.sigmas, depth.grey, _farthest_of_tiles(depth, voxel),
         camera.model_id, camera.params, view_T_floor[:3, :3].copy(), view_T_floor[:3, 3].copy(), corner, voxel,
     )  # fmt: skip
 
 
-def _coarse(ranges: F32) -> F32:
-    """Largest range of each tile and its eight neighbours; 0 where there is none."""
-    import cv2
-
-    h, w = (-(-n // TILE) for n in ranges.shape)
+@lru_cache(64)
+def _farthest_of_tiles(depth: DepthImage, voxel: float) -> F32:
+    """Largest range of each tile that is used, 0 where there is none."""
+    height, width = depth.ranges.shape
+    h, w = -(-height // TILE), -(-width // TILE)
     padded = np.zeros((h * TILE, w * TILE), np.float32)
-    padded[: ranges.shape[0], : ranges.shape[1]] = np.nan_to_num(ranges)
-    most = padded.reshape(h, TILE, w, TILE).max(axis=(1, 3))
-    return np.asarray(cv2.dilate(most, np.ones((3, 3), np.uint8)), np.float32)
+    padded[:height, :width] = np.where(depth.sigmas <= TRUNCATION * voxel, depth.ranges, 0)
+    return padded.reshape(h, TILE, w, TILE).max(axis=(1, 3))
+
+
+@inner
+def _farthest(tiles, left, right, top, bottom):
+    """Largest range of the tiles that pixels from `left` to `right` and `top` to `bottom` touch; -inf outside all."""
+    h, w = tiles.shape
+    most = -math.inf
+    if not (right >= 0 and bottom >= 0 and left < w * TILE and top < h * TILE):
+        return most
+    for r in range(int(max(top, 0.0)) // TILE, int(min(bottom, h * TILE - 1.0)) // TILE + 1):
+        for c in range(int(max(left, 0.0)) // TILE, int(min(right, w * TILE - 1.0)) // TILE + 1):
+            most = max(most, tiles[r, c])
+    return most
+
+
+@inner
+def _project_block(model, params, x, y, z, step, u, v):
+    """Pixels (3, 3, 3) of corners and middles of a block from (x, y, z) on; whether others are on parabolas."""
+    half = BLOCK // 2
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                a, b, c = half * i, half * j, half * k
+                found = project_one(
+                    model, params,
+                    x + a * step[0, 0] + b * step[0, 1] + c * step[0, 2],
+                    y + a * step[1, 0] + b * step[1, 1] + c * step[1, 2],
+                    z + a * step[2, 0] + b * step[2, 1] + c * step[2, 2],
+                )  # fmt: skip
+                u[i, j, k], v[i, j, k] = found[0], found[1]
+    even = True
+    for i in range(3):
+        for j in range(3):
+            for p in (u, v):
+                even &= abs(p[0, i, j] - 2 * p[1, i, j] + p[2, i, j]) <= BENT_PX  # not of NaN
+                even &= abs(p[i, 0, j] - 2 * p[i, 1, j] + p[i, 2, j]) <= BENT_PX
+                even &= abs(p[i, j, 0] - 2 * p[i, j, 1] + p[i, j, 2]) <= BENT_PX
+    return even
 
 
 @njit
-def _integrate(distance, weight, views, grey, ranges, sigmas, image, coarse, model, params, turn, shift, corner, voxel):
+def _integrate(distance, weight, views, grey, ranges, sigmas, image, tiles, model, params, turn, shift, corner, voxel):
     n = distance.shape[0]
     h, w = ranges.shape
     cut = TRUNCATION * voxel
     radius = 0.5 * math.sqrt(3.0) * BLOCK * voxel
+    step = voxel * turn
+    us, vs = np.empty((3, 3, 3)), np.empty((3, 3, 3))
+    u3, v3 = np.empty(3), np.empty(3)
+    share = np.empty((BLOCK, 3))  # of three values on a parabola, at each voxel
+    for k in range(BLOCK):
+        t = 2.0 * k / (BLOCK - 1) - 1.0
+        share[k] = 0.5 * t * (t - 1), 1 - t * t, 0.5 * t * (t + 1)
     for bx in range(0, n, BLOCK):
         for by in range(0, n, BLOCK):
             for bz in range(0, n, BLOCK):
-                x = corner[0] + (bx + 0.5 * (BLOCK - 1)) * voxel
-                y = corner[1] + (by + 0.5 * (BLOCK - 1)) * voxel
-                z = corner[2] + (bz + 0.5 * (BLOCK - 1)) * voxel
-                px = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[0]
-                py = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]
-                pz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
-                away = math.sqrt(px * px + py * py + pz * pz)
-                if away > radius and 1.5 * params[0] * radius < TILE * (away - radius):
-                    found = project_one(model, params, px, py, pz)
+                x, y, z = corner[0] + bx * voxel, corner[1] + by * voxel, corner[2] + bz * voxel
+                x0 = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[0]
+                y0 = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]
+                z0 = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
+                half = 0.5 * (BLOCK - 1)
+                px = x0 + half * (step[0, 0] + step[0, 1] + step[0, 2])
+                py = y0 + half * (step[1, 0] + step[1, 1] + step[1, 2])
+                pz = z0 + half * (step[2, 0] + step[2, 1] + step[2, 2])
+                near = math.sqrt(px * px + py * py + pz * pz) - radius
+                if near > 0 and 1.5 * params[0] * radius < TILE * near:
+                    found = project_one(model, params, px, py, pz)  # a block smaller than a tile
                     u, v = found[0], found[1]
-                    if not (-TILE <= u < w + TILE and -TILE <= v < h + TILE):
-                        continue  # outside the view, as the block is smaller than a tile there
-                    if 0 <= u < w and 0 <= v < h and away - radius > coarse[int(v) // TILE, int(u) // TILE] + cut:
-                        continue  # behind everything around, or nothing was measured
-                for i in range(bx, bx + BLOCK):
-                    for j in range(by, by + BLOCK):
-                        for k in range(bz, bz + BLOCK):
-                            x, y, z = corner[0] + i * voxel, corner[1] + j * voxel, corner[2] + k * voxel
-                            px = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[0]
-                            py = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[1]
-                            pz = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[2]
-                            found = project_one(model, params, px, py, pz)
-                            u, v = found[0], found[1]
+                    if not near <= _farthest(tiles, u - TILE, u + TILE, v - TILE, v + TILE) + cut:
+                        continue  # outside the view, behind everything around, or nothing was measured
+                even = _project_block(model, params, x0, y0, z0, step, us, vs)
+                ahead = np.isfinite(us).sum()
+                if ahead == 0:
+                    continue
+                hull = even or (model == PINHOLE and ahead == us.size)  # straight lines stay straight
+                if hull and near > _farthest(tiles, us.min() - 2, us.max() + 2, vs.min() - 2, vs.max() + 2) + cut:
+                    continue
+                for i in range(BLOCK):
+                    for j in range(BLOCK):
+                        if even:
+                            for c in range(3):
+                                u3[c] = v3[c] = 0.0
+                                for a in range(3):
+                                    for b in range(3):
+                                        s = share[i, a] * share[j, b]
+                                        u3[c] += s * us[a, b, c]
+                                        v3[c] += s * vs[a, b, c]
+                        x1 = x0 + i * step[0, 0] + j * step[0, 1]
+                        y1 = y0 + i * step[1, 0] + j * step[1, 1]
+                        z1 = z0 + i * step[2, 0] + j * step[2, 1]
+                        for k in range(BLOCK):
+                            px, py, pz = x1 + k * step[0, 2], y1 + k * step[1, 2], z1 + k * step[2, 2]
+                            if even:
+                                u = share[k, 0] * u3[0] + share[k, 1] * u3[1] + share[k, 2] * u3[2]
+                                v = share[k, 0] * v3[0] + share[k, 1] * v3[1] + share[k, 2] * v3[2]
+                            else:
+                                found = project_one(model, params, px, py, pz)
+                                u, v = found[0], found[1]
                             if not (0 <= u <= w - 1 and 0 <= v <= h - 1):
                                 continue
                             r, c = int(v + 0.5), int(u + 0.5)
@@ -155,10 +223,10 @@ def _integrate(distance, weight, views, grey, ranges, sigmas, image, coarse, mod
                             if d < -cut:
                                 continue
                             one = 1.0 / (sigma * sigma + 0.25 * voxel * voxel)
-                            distance[i, j, k] += one * min(d, cut)
-                            weight[i, j, k] += one
-                            views[i, j, k] += 1.0
-                            grey[i, j, k] += one * float(image[r, c])
+                            distance[bx + i, by + j, bz + k] += one * min(d, cut)
+                            weight[bx + i, by + j, bz + k] += one
+                            views[bx + i, by + j, bz + k] += 1.0
+                            grey[bx + i, by + j, bz + k] += one * float(image[r, c])
 
 
 def voxel_places(index: tuple[int, int, int]) -> I64:
