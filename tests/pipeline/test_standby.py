@@ -63,4 +63,6 @@ def test_a_standby_that_died_is_known_and_ends() -> None:
         assert time.monotonic() < until
         time.sleep(0.01)
     standby.close()
+    for process in standby.stages.processes.values():
+        process.join(60.0)
     assert not any(psutil.pid_exists(pid) for pid in pids.values())
