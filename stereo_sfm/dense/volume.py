@@ -42,7 +42,7 @@ class Seen(ReadOnly):
 
     def used(self, voxel: float) -> Bool:
         """(H, W) pixels whose range is known well enough to say where in the field a surface is."""
-        return self.depth.sigmas <= TRUNCATION * voxel
+        return _used(self.depth, voxel)
 
     def reach(self, voxel: float) -> float:
         """Largest range in metres that is used."""
@@ -107,13 +107,18 @@ def _add(sums: list[F32], seen: Seen, corner: F64, voxel: float) -> None:
     )  # fmt: skip
 
 
+def _used(depth: DepthImage, voxel: float) -> Bool:
+    """`Seen.used`, wherever the image is."""
+    return depth.sigmas <= TRUNCATION * voxel
+
+
 @lru_cache(64)
 def _farthest_of_tiles(depth: DepthImage, voxel: float) -> F32:
     """Largest range of each tile that is used, 0 where there is none."""
     height, width = depth.ranges.shape
     h, w = -(-height // TILE), -(-width // TILE)
     padded = np.zeros((h * TILE, w * TILE), np.float32)
-    padded[:height, :width] = np.where(depth.sigmas <= TRUNCATION * voxel, depth.ranges, 0)
+    padded[:height, :width] = np.where(_used(depth, voxel), depth.ranges, 0)
     return padded.reshape(h, TILE, w, TILE).max(axis=(1, 3))
 
 
