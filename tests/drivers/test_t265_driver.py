@@ -170,7 +170,7 @@ def test_unplugged_in_mid_frame_and_back_as_a_new_segment(caplog: pytest.LogCapt
     assert (source.counters["disconnects"], source.counters["segments"]) == (1, 2)
     assert images[8].dropped_before >= 12  # 0.4 s and the boot
     assert np.diff([i.stamp_ns for i in images]).min() > 0
-    assert re.search(r"T265: 25 stereo images, dropped \d+,( implausible \d+,)? disconnects 1", caplog.text)
+    assert re.search(r"T265: 25 stereo images, dropped \d+, disconnects 1", caplog.text)
     assert "the camera was disconnected" in caplog.text and "T265 is back: segment 2" in caplog.text
     inertial = [i.imu.stamp_ns for i in images if i.imu is not None]
     assert (np.diff(np.concatenate(inertial)) >= 0).all()
