@@ -22,10 +22,10 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.chi_squared import chi_squared
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.tracking.inertial.inertial_filter import SPEED_SIGMA
 from stereo_sfm.types import F64, I64, Bool, MotionLink
 
 FIRST_ROUND = 10.0  # times as much is allowed before the poses are adjusted: until then it is they that may be wrong
-SPEED_SIGMA = 10.0  # m/s, where the tracker does not know the velocity: more than any robot's, as if nothing were known
 STATE = 9  # numbers: velocity in the map, biases of accelerometer and gyroscope
 
 

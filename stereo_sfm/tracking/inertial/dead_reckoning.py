@@ -20,11 +20,12 @@ from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import Preintegrated
 from stereo_sfm.tracking.inertial.inertial_filter import InertialState
+from stereo_sfm.tracking.inertial.rotation_filter import DOUBTED_CHI2
 from stereo_sfm.types import F64
 
 # Rows of the errors of position, velocity, rotation, gravity, both biases, and what the wheels do not know.
 P, V, R, G, BA, BG, S = (slice(a, b) for a, b in ((0, 3), (3, 6), (6, 9), (9, 12), (12, 15), (15, 18), (18, 22)))
-DOUBTED_CHI2, SLIPS_CHI2 = 11.3, 50.0  # of three degrees of freedom: from 99 % on it counts less, then not at all
+SLIPS_CHI2 = 50.0  # of three degrees of freedom: from here on it does not count at all
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ DRIFT_SIGMA, DRIFT_S = 2e-4, 10.0  # rad/s of the odometry's rotation, and secon
 ROTATION_WALK = 1e-4  # rad/sqrt(s) of the odometry's rotation, at least
 KNOWN = 1.0  # m/s^2, standard deviation of gravity from which its size counts
 FIRST_DRIFT_SIGMA = 1e-3  # rad/s, before the rotations have shown the gyroscope's bias better
-SPEED_SIGMA = 10.0  # m/s, before anything is known
+SPEED_SIGMA = 10.0  # m/s, before anything is known: more than any robot's
 WRONG_CHI2 = 25.0  # of a motion's three positions: it counts less, as far as that is exceeded
 FORCE_S = 5.0  # over which the mean force is taken
 

@@ -16,7 +16,7 @@ from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.rotation_filter import RotationFilter
-from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
+from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
 from stereo_sfm.types import F64, I64, ImuSamples, InertialLink
 
 NODE_NS = 200_000_000  # between the poses of the filter
@@ -252,15 +252,11 @@ class InertialMotion:
     def motion(self, begin_ns: int, end_ns: int) -> Preintegrated | None:
         """From one time to another with the biases of today; each is asked for several times a frame."""
         if (begin_ns, end_ns) not in self._integrated:
-            intervals = self._buffer.between(begin_ns, end_ns)
-            self._integrated[begin_ns, end_ns] = None if intervals is None else self._preintegrate(intervals)
+            found, biases, imu = self._buffer.between(begin_ns, end_ns), (self._gyro_bias, np.zeros(3)), self._imu
+            self._integrated[begin_ns, end_ns] = None if found is None else preintegrate(
+                found.seconds, found.gyro, found.accel, *biases, imu.gyro_noise, imu.accel_noise
+            )  # fmt: skip
         return self._integrated[begin_ns, end_ns]
-
-    def _preintegrate(self, intervals: Intervals) -> Preintegrated:
-        return preintegrate(
-            intervals.seconds, intervals.gyro, intervals.accel, self._gyro_bias, np.zeros(3), self._imu.gyro_noise,
-            self._imu.accel_noise,
-        )  # fmt: skip
 
     def _velocity(self) -> F64:
         """(3,) m/s of the IMU at the last pose: the filter's, taken on from its newest pose."""

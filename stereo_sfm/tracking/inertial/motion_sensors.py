@@ -7,16 +7,56 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.inertial.collected_samples import CollectedSamples
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.rest import Rest
 from stereo_sfm.tracking.inertial.wheel_motion import LINK_NS, WheelMotion
-from stereo_sfm.types import F64, InertialLink, MotionLink, SensorSamples, SensorUpdate, StereoImage
+from stereo_sfm.types import (
+    F64,
+    ImuSamples,
+    InertialLink,
+    MotionLink,
+    SensorSamples,
+    SensorUpdate,
+    StereoImage,
+    WheelSamples,
+)
 
 SHORT_S = 0.2  # over which the IMU alone is as good as with the wheels
 INERTIAL_S, WHEEL_S = 10.0, 30.0  # longest time without images, by the IMU alone and with wheels
 BRIDGED_M = 0.5  # largest standard deviation of a position without images
+
+
+class CollectedSamples:
+    """What calibrates IMU and wheels: poses that the images gave, and all samples between, since the last keyframe."""
+
+    def __init__(self) -> None:
+        self._stamp_ns: list[int] = []
+        self._poses: list[F64] = []
+        self._imu: list[ImuSamples] = []
+        self._wheel: list[WheelSamples] = []
+
+    def feed(self, image: StereoImage) -> None:
+        """The samples up to the image that is tracked next."""
+        if image.imu is not None and len(image.imu):
+            self._imu.append(image.imu)
+        if image.wheel is not None and len(image.wheel):
+            self._wheel.append(image.wheel)
+
+    def begin(self) -> None:
+        """The odometry begins anew: poses from before do not go with those to come."""
+        self._stamp_ns, self._poses = [], []
+
+    def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
+        """The images gave this pose (4, 4)."""
+        self._stamp_ns.append(stamp_ns)
+        self._poses.append(odom_T_cam.copy())
+
+    def joined(self) -> SensorSamples:
+        """What was collected."""
+        imu = ImuSamples.joined(self._imu) if self._imu else None
+        wheel = WheelSamples.joined(self._wheel) if self._wheel else None
+        return SensorSamples(np.array(self._stamp_ns, np.int64), np.array(self._poses).reshape(-1, 4, 4), imu, wheel)
 
 
 class MotionSensors:

@@ -32,8 +32,11 @@ class Rest:
         self._seen.append((stamp_ns, odom_T_cam))
         while len(self._seen) > 2 and self._seen[1][0] <= stamp_ns - STILL_NS:
             self._seen.popleft()
-        held = self._held
-        still = self._images_still(stamp_ns) if held is None else _within(held, odom_T_cam, HELD)
+        held, (first_ns, first) = self._held, self._seen[0]
+        if held is None:
+            still = stamp_ns - first_ns >= STILL_NS and _within(first, odom_T_cam, SEEN)
+        else:
+            still = _within(held, odom_T_cam, HELD)
         if not still or not sensors_still():
             self._held, self._count = None, 0
             return odom_T_cam
@@ -48,10 +51,6 @@ class Rest:
         """The odometry begins anew."""
         self._seen.clear()
         self._held, self._count = None, 0
-
-    def _images_still(self, stamp_ns: int) -> bool:
-        first_ns, first = self._seen[0]
-        return stamp_ns - first_ns >= STILL_NS and _within(first, self._seen[-1][1], SEEN)
 
 
 def _within(a: F64, b: F64, limits: tuple[float, float]) -> bool:

@@ -32,7 +32,7 @@ class SampleBuffer:
 
     def __init__(self, imu: Imu) -> None:
         self._imu = imu
-        self._series = Series(6, MAX_GAP_S)
+        self._series = Series(MAX_GAP_S)
         self._accel_stamp_ns: I64 = np.zeros(0, np.int64)  # of the accelerometer alone, the last ones
         self._accel_alone: F64 = np.zeros((0, 3))
 

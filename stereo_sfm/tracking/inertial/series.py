@@ -13,15 +13,13 @@ MEMORY_S = 4.0  # how far back intervals may begin, besides the time since the l
 
 
 class Series:
-    """Samples with ascending stamps; what is missing only shortens what can be integrated."""
+    """Samples of two vectors with ascending stamps; what is missing only shortens what can be integrated."""
 
-    def __init__(self, columns: int, max_gap_s: float) -> None:
-        """Args:
-        columns: of a sample. max_gap_s: between samples; longer ones are not bridged.
-        """
+    def __init__(self, max_gap_s: float) -> None:
+        """`max_gap_s`: between samples; longer ones are not bridged."""
         self._max_gap_ns = max_gap_s * 1e9
         self.stamp_ns: I64 = np.zeros(0, np.int64)
-        self._values: F64 = np.zeros((0, columns))
+        self._values: F64 = np.zeros((0, 6))
 
     def after_last(self, stamp_ns: I64) -> I64:
         """Rows of new stamps (N,) that are later than all before them in turn."""

@@ -13,8 +13,8 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, Bool
 
 VELOCITY_S = 0.2  # over which the velocity is measured where the images come back
-START_SPEED_SIGMA, ACCEL_SIGMA = 0.008, 0.03  # m/s and m/s^2, what is expected of the errors
-END_SIGMA, END_SPEED_SIGMA = 0.002, 0.02  # m and m/s, of what is measured where the images come back
+# Standard deviations: m/s and m/s^2 of the errors that are expected, m and m/s where the images come back.
+SIGMAS = np.array([0.008, 0.03, 0.002, 0.02])
 SPEED_CHI2 = 16.8  # of six: beyond (1 % of right ones) the velocity is left out
 
 
@@ -44,7 +44,7 @@ def _corrected(stamp_ns: I64, poses: F64, first: int, end: int) -> F64:
     # Rows: expected velocity and acceleration error, position and velocity error at the end.
     rows = np.array([[1.0, 0.0], [0.0, 1.0], [length, 0.5 * length**2], [1.0, length]])
     enough = len(after) >= 3 and end - first >= 2
-    sigmas = np.array([START_SPEED_SIGMA, ACCEL_SIGMA, END_SIGMA, END_SPEED_SIGMA if enough else np.inf])[:, None]
+    sigmas = np.where([True, True, True, enough], SIGMAS, np.inf)[:, None]
     seen = np.stack([np.zeros(3), np.zeros(3), error, error_speed])
     found, chi2, *_ = np.linalg.lstsq(rows / sigmas, seen / sigmas)
     if enough and chi2.sum() > SPEED_CHI2:

@@ -20,7 +20,7 @@ from stereo_sfm.types import F64, MotionLink, WheelSamples
 MAX_GAP_S = 0.25  # between samples: longer ones are not bridged
 LINK_NS = 500_000_000  # of the comparison with the images
 STILL = 1e-3  # m/s, rad/s of a robot at rest
-ACCELERATION, TURN_ACCELERATION = 3.0, 5.0  # m/s^2, rad/s^2: wheels that change faster slip or are broken
+ACCELERATION = np.array([3.0, 5.0])  # m/s^2, rad/s^2: wheels that change faster slip or are broken
 
 
 class WheelMotion:
@@ -28,7 +28,7 @@ class WheelMotion:
 
     def __init__(self, wheel: Wheel) -> None:
         self._wheel, self._wheel_T_left = wheel, se3.inverse(wheel.left_T_wheel)
-        self._series = Series(6, MAX_GAP_S)
+        self._series = Series(MAX_GAP_S)
         self._window = WheelWindow(wheel.model, wheel.slip)
         self._known: WheelCorrection | None = None  # what the window says, once asked for
         self._last_ns = self._link_ns = 0
@@ -126,8 +126,7 @@ class WheelMotion:
             return step
         seconds = (stamp_ns - self._last_ns) * 1e-9
         change = self._in_camera(motion) - self._last_step[1] * (seconds / self._last_step[0])
-        limits = ACCELERATION * seconds**2, TURN_ACCELERATION * seconds**2
-        for part, limit in zip((change[:3], change[3:]), limits, strict=True):
+        for part, limit in zip((change[:3], change[3:]), ACCELERATION * seconds**2, strict=True):
             part *= min(1.0, limit / max(math.sqrt(float(part @ part)), 1e-12))
         return step + change
 
@@ -165,9 +164,13 @@ class WheelMotion:
 
     def link(self, begin_ns: int, stamp_ns: int) -> MotionLink | None:
         """The camera's motion from one time to another; None where samples are missing, or the wheels do not count."""
-        motion = self._by_wheels(begin_ns, stamp_ns) if self._window.agreed else None
-        if motion is None:
+        edges = self._series.edges(begin_ns, stamp_ns) if self._window.agreed else None
+        if edges is None:
             return None
+        c, values = self._correction, self._series.means(edges)
+        motion = integrate_twists(
+            np.diff(edges) * 1e-9, values[:, 3:] * c.turn, values[:, :3] @ c.matrix.T, c.turn_noise, c.noise
+        )
         moved = se3.from_rotation_translation(motion.rotation, motion.position)
         covariance = self._covariance(motion)
         end_R_begin = np.kron(np.eye(2), motion.rotation.T)
@@ -175,15 +178,6 @@ class WheelMotion:
         left_T_wheel = self._wheel.left_T_wheel
         into = se3.adjoint(left_T_wheel) @ end_R_begin
         return MotionLink(left_T_wheel @ moved @ se3.inverse(left_T_wheel), into @ covariance @ into.T)
-
-    def _by_wheels(self, begin_ns: int, stamp_ns: int) -> TwistMotion | None:
-        edges = self._series.edges(begin_ns, stamp_ns)
-        if edges is None:
-            return None
-        c, values = self._correction, self._series.means(edges)
-        return integrate_twists(
-            np.diff(edges) * 1e-9, values[:, 3:] * c.turn, values[:, :3] @ c.matrix.T, c.turn_noise, c.noise
-        )
 
     def _covariance(self, motion: TwistMotion) -> F64:
         """(6, 6) of position (axes at the beginning) and rotation (right tangent)."""

@@ -19,10 +19,10 @@ DIRECTION_SIGMA = 0.03  # rad, expected of a calibration
 TURN_SIGMA = {"skid_steer": 0.3}  # expected of the scale of turns, where that is not the slip
 STRAIGHT = 0.05  # rad/s of a robot that does not turn
 TURN_FREE = 0.03, 0.1  # rad and share by which turns differ without slip
-MIN_SIGMA_M, MIN_SIGMA_RAD = 0.003, 0.003  # standard deviation of a link's difference, at least
+MIN_SIGMA = 0.003  # m, rad: standard deviation of a link's difference, at least
 SHOWN, JUDGED = 2, 6  # links for the comparison with the images: before they count, and before they are left out
 WRONG, RIGHT = 0.5, 0.25  # of the way: more is another motion, less is the same again
-NOTICED_M, NOTICED_RAD = 0.1, 0.1  # of way and of turns, before anything is judged
+NOTICED = 0.1  # m of way, rad of turns, before anything is judged
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +79,7 @@ class WheelWindow:
         recent = list(self._links)[-JUDGED:]
         ways = [(np.sum((k.way - k.seen) ** 2), max(k.way @ k.way, k.seen @ k.seen)) for k in recent]
         turns = [((k.turn - k.turn_seen) ** 2, max(k.turn**2, k.turn_seen**2)) for k in recent]
-        judged = [
-            float(off / size)
-            for (off, size), noticed in ((np.sum(ways, 0), NOTICED_M), (np.sum(turns, 0), NOTICED_RAD))
-            if size > noticed**2
-        ]
+        judged = [float(off / size) for off, size in (np.sum(ways, 0), np.sum(turns, 0)) if size > NOTICED**2]
         if not judged:
             return
         if len(recent) == JUDGED:
@@ -111,7 +107,7 @@ class WheelWindow:
     def _direction(self) -> tuple[F64, F64, float]:
         """Logarithmic scale and direction (4,), their covariance, and the variance of what is left of a link's way."""
         prior: F64 = np.diag(1.0 / np.square([self._slip, DIRECTION_SIGMA, DIRECTION_SIGMA, DIRECTION_SIGMA]))
-        x, information, sigma2 = np.zeros(4), prior, MIN_SIGMA_M**2
+        x, information, sigma2 = np.zeros(4), prior, MIN_SIGMA**2
         if not self._links:
             return x, np.linalg.inv(information).astype(np.float64), sigma2
         way, seen = np.stack([k.way for k in self._links]), np.stack([k.seen for k in self._links])
@@ -123,7 +119,7 @@ class WheelWindow:
             information = prior + np.einsum("nij,nik->jk", weighted, jacobian)
             x = np.linalg.solve(information, np.einsum("nij,ni->j", weighted, error))
             left = (error - jacobian @ x)[usual]
-            sigma2 = max(float(np.mean(left**2)) if len(left) else 0.0, MIN_SIGMA_M**2)
+            sigma2 = max(float(np.mean(left**2)) if len(left) else 0.0, MIN_SIGMA**2)
         return x.astype(np.float64), np.linalg.inv(information).astype(np.float64), sigma2
 
     def doubt(self, seconds: float, by_wheels: float, turned: float) -> float:
@@ -145,9 +141,9 @@ class WheelWindow:
     def _turn(self) -> tuple[float, float, float]:
         """Scale of turns, its standard deviation, and the variance of what is left of a link's turn."""
         w, v = (np.array([getattr(k, name) for k in self._links], float) for name in ("turn", "turn_seen"))
-        scale, information, sigma2 = 1.0, 1.0 / self._turn_sigma**2, MIN_SIGMA_RAD**2
+        scale, information, sigma2 = 1.0, 1.0 / self._turn_sigma**2, MIN_SIGMA**2
         for _ in range(2):
             information = 1.0 / self._turn_sigma**2 + float(w @ w) / sigma2
             scale = 1.0 + float(w @ (v - w)) / sigma2 / information
-            sigma2 = max(float(np.mean(np.square(v - scale * w))) if len(w) else 0.0, MIN_SIGMA_RAD**2)
+            sigma2 = max(float(np.mean(np.square(v - scale * w))) if len(w) else 0.0, MIN_SIGMA**2)
         return scale, float(information**-0.5), sigma2
