@@ -32,14 +32,10 @@ def check_columns(arrays: Mapping[str, Any]) -> None:
         if array.dtype.kind == "f" and not (np.isfinite(array) | (column.unknown & np.isnan(array))).all():
             raise ValueError(f"{name} is not finite")
         if array.dtype.kind == "i" and name != "stamp_ns":
-            _check_numbers(name, array, column, rows.get(column.index, MAX_ID))
+            if len(array) and not 0 <= array.min() <= array.max() < rows.get(column.index, MAX_ID):
+                raise ValueError(f"{name} has numbers from {array.min()} to {array.max()}")
+            if column.ascending and (np.diff(array) <= 0).any():
+                raise ValueError(f"{name} is not in order")
     rotations = arrays["map_T_kf"][:, :3, :3]
     if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=ROTATION_TOLERANCE):
         raise ValueError("map_T_kf is not rigid")
-
-
-def _check_numbers(name: str, array: Any, column: Column, above: int) -> None:
-    if len(array) and not 0 <= array.min() <= array.max() < above:
-        raise ValueError(f"{name} has numbers from {array.min()} to {array.max()}")
-    if column.ascending and (np.diff(array) <= 0).any():
-        raise ValueError(f"{name} is not in order")

@@ -70,7 +70,9 @@ class GrowingMap:
             raise StereoSfmError("the session was not found in the saved map yet")
         self._part, s = part, part.snapshot
         ids = s.kf_ids + self._first_kf
-        self._cull_keyframes(ids)
+        for gone in self._odometry.keys() - set(ids.tolist()):
+            del self._odometry[gone]
+            self._map.cull_keyframe(self._map.kf_row(gone))
         new = np.array([k not in self._odometry for k in ids.tolist()], bool)
         self._place(s, ids, new, place)
         pt_ids = self._enter_points(s, ids, new)
@@ -87,7 +89,9 @@ class GrowingMap:
         if self._part is None:
             return False
         if self._closer is None:
-            self._closer = self._new_closer()
+            self._closer = self._joining.closer(self._vocabulary)
+            for keyframe in self._base.snapshot.keyframes():  # the saved map is one rigid piece
+                self._closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), self._rigs[keyframe.kf_id])
             return True
         if not self._queue:
             return self._adjust()
@@ -109,11 +113,6 @@ class GrowingMap:
         return int(self._base.sessions.max()) + 1
 
     # -- what the session mapped -------------------------------------------------------------------------------------
-
-    def _cull_keyframes(self, ids: I64) -> None:
-        for gone in self._odometry.keys() - set(ids.tolist()):
-            del self._odometry[gone]
-            self._map.cull_keyframe(self._map.kf_row(gone))
 
     def _place(self, s: MapSnapshot, ids: I64, new: Bool, place: LoopResult | None) -> None:
         """Add the new keyframes: each lies to the newest joined one of its submap as in the session."""
@@ -195,13 +194,6 @@ class GrowingMap:
                 stamp = keyframe.stamp_ns - int(s.stamp_ns[0])
                 submap = keyframe.submap_id + 1
                 self._queue.append(dataclasses.replace(keyframe, odom_T_cam=odometry, submap_id=submap, stamp_ns=stamp))
-
-    def _new_closer(self) -> LoopCloser:
-        """It knows the saved map, which is one rigid piece."""
-        closer = self._joining.closer(self._vocabulary)
-        for keyframe in self._base.snapshot.keyframes():
-            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), self._rigs[keyframe.kf_id])
-        return closer
 
     def _close(self, loop: LoopResult) -> None:
         map_ = self._map

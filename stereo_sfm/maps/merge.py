@@ -126,7 +126,7 @@ def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unse
 
 
 def subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnapshot:
-    """The rows selected by boolean masks; points anchored in a removed keyframe get another one that observes them."""
+    """The rows selected by boolean masks; points anchored in a removed keyframe get the oldest that observes them."""
     kept = {"keyframes": keyframes, "points": points, "observations": obs, "corners": keyframes[s.corner_kf]}
     row = {"keyframes": np.cumsum(keyframes) - 1, "points": np.cumsum(points) - 1}
     out: dict[str, Any] = {}
@@ -134,13 +134,8 @@ def subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnaps
         if name != "sessions":
             values = getattr(s, name)[kept[column.table]]
             out[name] = row[column.index][values] if column.index else values
-    gone = ~keyframes[s.anchors[points]]
-    out["anchors"][gone] = _first_observer(out["obs_kf"], out["obs_pt"], points)[gone]
+    gone, none = ~keyframes[s.anchors[points]], np.iinfo(np.int64).max
+    first = np.full(int(points.sum()), none)
+    np.minimum.at(first, out["obs_pt"], out["obs_kf"])
+    out["anchors"][gone] = np.where(first == none, 0, first)[gone]
     return MapSnapshot(**out)
-
-
-def _first_observer(obs_kf: I64, obs_pt: I64, points: Bool) -> I64:
-    """(P,) oldest keyframe that observes each kept point, 0 if none."""
-    first = np.full(int(points.sum()), np.iinfo(np.int64).max)
-    np.minimum.at(first, obs_pt, obs_kf)
-    return np.where(first == np.iinfo(np.int64).max, 0, first)

@@ -32,7 +32,7 @@ from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.tracking.flow.recovery import RIVAL
 from stereo_sfm.types import F64, I64, Keyframe
 
-SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place: lamps and products repeat at larger steps
+SAME_PLACE = 0.2, 5.0  # metres, degrees: closer results are the same place: lamps and products repeat at larger steps
 MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
 PLACES = 16  # that are verified for an image, and for its side views, where no confident one ends the search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
@@ -70,7 +70,7 @@ def not_found(reason: str, inliers: int = 0) -> Location:
 
 def _distinct(a: Location, b: Location) -> bool:
     """Whether they are different places."""
-    return not within(se3.inverse(a.map_T_cam) @ b.map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG)
+    return not within(se3.inverse(a.map_T_cam) @ b.map_T_cam, *SAME_PLACE)
 
 
 class Relocalizer:
@@ -194,9 +194,8 @@ class Relocalizer:
         b_T_a = se3.inverse(place.map_T_cam) @ self.map.map_T_kf[row]
         pose = refine_pose(b_T_a, together, self._rig, self.config.sigma_px)
         map_T_cam = self.map.map_T_kf[row] @ se3.inverse(pose.b_T_a)
-        if not within(se3.inverse(place.map_T_cam) @ map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG):
-            return place
-        return dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
+        refined = dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
+        return place if _distinct(place, refined) else refined
 
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
