@@ -98,7 +98,7 @@ class DescriptorTracker:
         state: TrackState,
         reason: str,
         is_keyframe: bool,
-        stats: dict[str, float],
+        stats: dict[str, float] | None = None,
         covariance: F64 | None = None,
     ) -> Frame:
         rows = view.ids >= 0  # those that were seen before are the inliers of the pose
@@ -116,5 +116,5 @@ class DescriptorTracker:
             kf_T_cam=se3.inverse(self._odom_T_kfs.get(self._kf_id, np.eye(4))) @ self._odom_T_cam,
             map_version=self._map_version,
             is_keyframe=is_keyframe,
-            stats={"features": float(len(view)), **stats},
+            stats={"features": float(len(view)), **(stats or {"inliers": 0.0})},
         )

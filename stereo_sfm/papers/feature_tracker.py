@@ -86,7 +86,7 @@ class FeatureTracker(DescriptorTracker):
 
     def _begin(self, image: StereoImage, view: FeatureView) -> tuple[Frame, Keyframe | None]:
         if len(view) < self._odometry.min_inliers:
-            return self._frame(image, view, TrackState.INITIALIZING, "too_few_points", False, _stats(None)), None
+            return self._frame(image, view, TrackState.INITIALIZING, "too_few_points", False), None
         return self._begin_here(image, view, TrackState.OK, "")
 
     def _begin_here(
@@ -95,7 +95,7 @@ class FeatureTracker(DescriptorTracker):
         view = self._ids.give_new(view)
         keyframe = self._make_keyframe(image, view)
         self._remember(image, view)
-        return self._frame(image, view, state, reason, True, _stats(None)), keyframe
+        return self._frame(image, view, state, reason, True), keyframe
 
     def _move(
         self, image: StereoImage, view: FeatureView, rng: np.random.Generator
@@ -143,7 +143,7 @@ class FeatureTracker(DescriptorTracker):
         seconds = self._count_lost(image.stamp_ns)
         self._odom_T_cam = self._odom_T_cam @ self._velocity
         if seconds <= self._config.tracker.lost_s or len(view) < self._odometry.min_inliers:
-            return self._frame(image, view, TrackState.LOST, reason, False, _stats(None)), None
+            return self._frame(image, view, TrackState.LOST, reason, False), None
         self._lost = 0
         self._submap += 1
         self._velocity = np.eye(4)
@@ -155,8 +155,10 @@ class FeatureTracker(DescriptorTracker):
         self._frames_since_kf += 1
         chosen = np.isfinite(view.points[:, 2]) & (view.ages > 0)
         covariance = pose_covariance(view.points[chosen], self._pixel)
-        wanted = self._wants_keyframe(view, int(motion.inliers.sum()))
-        frame = self._frame(image, view, state, "", wanted, _stats(motion), covariance)
+        inliers = int(motion.inliers.sum())
+        wanted = self._wants_keyframe(view, inliers)
+        stats = {"inliers": float(inliers), "matches": float(len(motion.inliers)), **motion.stats}
+        frame = self._frame(image, view, state, "", wanted, stats, covariance)
         keyframe = self._make_keyframe(image, view) if wanted else None
         self._remember(image, view)
         return (replace(frame, reference_kf_id=self._kf_id, kf_T_cam=np.eye(4)) if wanted else frame), keyframe
@@ -191,13 +193,6 @@ def _pair(last: FeatureView, now: FeatureView, rows: I64, pixel_rad: float) -> F
         last.bearings[a], now.bearings[b], last.points[a], now.points[b], last.sigmas[a], now.sigmas[b], pixel_rad,
         last.image, now.image, last.frame_id, now.frame_id,
     )  # fmt: skip
-
-
-def _stats(motion: Motion | None) -> dict[str, float]:
-    """Of a frame."""
-    if motion is None:
-        return {"inliers": 0.0}
-    return {"inliers": float(motion.inliers.sum()), "matches": float(len(motion.inliers)), **motion.stats}
 
 
 def _moved(points: F64, ids: I64, update: MapUpdate, kf_T_map: F64) -> F64:

@@ -18,8 +18,6 @@ from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.descriptors import RADIUS
 from stereo_sfm.types import F64, I32, I64, U8, Bool, Message, StereoImage
 
-MIN_DISPARITY_PX = 0.5  # below, the depth is treated as unknown
-
 
 @dataclass(frozen=True, eq=False)
 class FeatureView(Message):
@@ -83,7 +81,8 @@ class ViewMaker:
         a, b = bearings[matches[:, 0]], other_bearings[matches[:, 1]]
         found = triangulate(a, b, self._rig.left_T_right)
         turned = b @ self._rig.left_T_right[:3, :3].T
-        enough = np.linalg.norm(np.cross(a, turned), axis=1) > MIN_DISPARITY_PX * self._rig.pixel_angle
+        # Below a disparity of half a pixel the depth is treated as unknown.
+        enough = np.linalg.norm(np.cross(a, turned), axis=1) > 0.5 * self._rig.pixel_angle
         keep = enough & np.isfinite(found[:, 2])
         points[matches[keep, 0]] = found[keep]
         uv_right[matches[keep, 0]] = other.uv[matches[keep, 1]]

@@ -27,8 +27,7 @@ from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, I64, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner
-_MAX_STEP = 0.5  # of the median distance of the points: a larger step between frames is an error
-_MAX_TURN = np.radians(30.0)  # radians, for its rotation
+_MAX_TURN = np.radians(30.0)  # radians: a larger rotation between frames is an error
 _REPROJECT_PX = 3.0  # px by which a point may be off its projection: that of a keyframe before bundle adjustment
 
 
@@ -98,7 +97,7 @@ class MonocularTracker(DescriptorTracker):
         if new_first:
             self._first, self._first_stamp, self._first_age = view, image.stamp_ns, 0
         state = TrackState.INITIALIZING if self._submap == 0 else TrackState.LOST
-        return self._frame(image, view, state, reason, False, {"inliers": 0.0}), None
+        return self._frame(image, view, state, reason, False), None
 
     # -- tracking --------------------------------------------------------------------------------------------------
 
@@ -136,7 +135,7 @@ class MonocularTracker(DescriptorTracker):
             Degenerate: "implausible_pose".
         """
         step = se3.inverse(self._odom_T_cam) @ pose
-        reach = _MAX_STEP * (1 + self._lost) * float(np.median(np.linalg.norm(points, axis=1)))
+        reach = 0.5 * (1 + self._lost) * float(np.median(np.linalg.norm(points, axis=1)))
         turn = float(np.linalg.norm(se3.so3_log(step[:3, :3])))
         if np.linalg.norm(step[:3, 3]) > reach or turn > _MAX_TURN * (1 + self._lost):
             raise Degenerate("implausible_pose", "the pose jumps")
@@ -197,7 +196,7 @@ class MonocularTracker(DescriptorTracker):
             self._keyframe = None
             self._first, self._first_stamp, self._first_age = view, image.stamp_ns, 0
             self._local = LocalPoints(np.zeros(0, np.int64), np.zeros((0, 3)), self._kind.empty())
-        return self._frame(image, view, TrackState.LOST, reason, False, {"inliers": 0.0}), None
+        return self._frame(image, view, TrackState.LOST, reason, False), None
 
     def _enter(self, view: FeatureView, stamp_ns: int, odom_T_cam: F64) -> Keyframe:
         """Its points are matched with later keyframes, too."""
