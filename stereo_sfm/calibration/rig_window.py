@@ -24,10 +24,11 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import PINHOLE, RADTAN
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import rectifying_rotations
+from stereo_sfm.tracking.flow.sudden_turn import MIN_POINTS
 from stereo_sfm.types import F64, I64, RIG_TERMS, Bool, Keyframe
 
-# Of a window: so many leave seven rows for each of its unknowns; more say little, as windows have errors of their own.
-MIN_POINTS, MAX_POINTS = 20, 160
+# Of a window, at most: more say little, as windows have errors of their own.
+MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton: two that find what does not fit, two without it
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandths of a pixel
 NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit

@@ -15,7 +15,7 @@ from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, Keyframe, RowErrors
 
 GRID = (3, 4)  # rows and columns of regions: a turn of a camera and an error of its lens look different in them
-FAST_SHARE, SLOW_SHARE = 0.2, 0.04  # weight of the newest keyframe in the averages: over about 5 and 25 keyframes
+SHARES = np.array([0.2, 0.04])  # weight of the newest keyframe in the averages: over about 5 and 25 keyframes
 MIN_MATCHES = 5  # of a region, whose median two wrong ones then do not decide
 # Of the systematic part, the larger one of the two: matches are lost from 1 px on, and the same small turn of a camera
 # is many pixels of a long lens. Half a pixel is 0.05 degrees at a focal length of 573 px.
@@ -32,16 +32,16 @@ class RowMonitor:
     def use(self, rig: Rig) -> None:
         """Start again with another rig."""
         self._rig = rig
-        self._fast: F64 = np.full(GRID, np.nan)
-        self._slow: F64 = np.full(GRID, np.nan)
+        self._averages: F64 = np.full((len(SHARES), *GRID), np.nan)  # fast and slow
 
     def add(self, keyframe: Keyframe) -> RowErrors:
         """The averages after this keyframe."""
-        now = self._regions(keyframe)
-        self._fast, self._slow = _averaged(self._fast, now, FAST_SHARE), _averaged(self._slow, now, SLOW_SHARE)
-        systematic, before = _size(self._fast), _size(self._slow)
+        now, before, share = self._regions(keyframe), self._averages, SHARES[:, None, None]
+        mixed = np.where(np.isnan(before), now, (1 - share) * before + share * now)
+        self._averages = np.where(np.isnan(now), before, mixed)
+        systematic, earlier = _size(self._averages[0]), _size(self._averages[1])
         return RowErrors(
-            keyframe.kf_id, keyframe.stamp_ns, self._fast.ravel().copy(), systematic, systematic - before,
+            keyframe.kf_id, keyframe.stamp_ns, self._averages[0].ravel().copy(), systematic, systematic - earlier,
             systematic > max(WARN_PX, self._rig.left.fx * np.deg2rad(WARN_DEG)),
         )  # fmt: skip
 
@@ -60,11 +60,6 @@ class RowMonitor:
             if len(here) >= MIN_MATCHES:
                 out[k] = median(here)
         return out.reshape(GRID)
-
-
-def _averaged(before: F64, now: F64, share: float) -> F64:
-    mixed = np.where(np.isnan(before), now, (1 - share) * before + share * now)
-    return np.where(np.isnan(now), before, mixed)
 
 
 def _size(regions: F64) -> float:

@@ -159,14 +159,11 @@ class SelfCalibration:
                 self._since = max(self._since, self.windows[1].first_kf_id)
             self.windows.append(window)
             self._until_due -= 1
-            self._drop_misled()
+            # Those tracked with a rig that was far off go, once there are enough others.
+            later = [w for w in self.windows if w.first_kf_id > self._misled_kf_id]
+            if ENOUGH_WINDOWS <= len(later) < len(self.windows):
+                self.windows = deque(later, maxlen=MAX_WINDOWS)
         return window is not None
-
-    def _drop_misled(self) -> None:
-        """Discard the windows tracked with a rig that was far off, once there are enough others."""
-        later = [w for w in self.windows if w.first_kf_id > self._misled_kf_id]
-        if ENOUGH_WINDOWS <= len(later) < len(self.windows):
-            self.windows = deque(later, maxlen=MAX_WINDOWS)
 
     def _revise(self, refined_sigmas: float = REFINED_SIGMAS) -> Revision | None:
         """`refined_sigmas`: significance of further corrections of a term."""

@@ -120,7 +120,7 @@ class Follower:
     def renewed(self, reference: ReferenceImage) -> Tracks:
         """The points of the reference image, with their appearance in it instead of their first one."""
         rows, slots = self.begin(reference.images.left, reference.tracks.uv, reference.pose)
-        tracks = reference.tracks.keep(_mask(rows, len(reference.tracks)))
+        tracks = reference.tracks.take(rows)
         tracks.slot, tracks.warp = slots, np.tile(np.eye(2), (len(rows), 1, 1))
         return tracks
 
@@ -135,21 +135,14 @@ class Follower:
         guess, warps = self._seen_from(pose)
         rows = np.flatnonzero(self._visible(guess, warps))
         rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
-        tracks, warps = tracks.keep(_mask(rows, len(tracks))), np.ascontiguousarray(warps[:, rows])
+        tracks, warps = tracks.take(rows), np.ascontiguousarray(warps[:, rows])
         uv, warp = guess[rows].copy(), tracks.warp.copy()
         radius = max(round(0.5 * reach * self._camera.width), 1)
         step = math.ceil(radius / SEARCH_STEPS)
         ncc = find_deformed(
-            pyramid[1],
-            guess[rows],
-            warps @ tracks.warp,
-            tracks.slot,
-            self._patches.windows.patch,
-            radius,
-            step,
-            uv,
+            pyramid[1], guess[rows], warps @ tracks.warp, tracks.slot, self._patches.windows.patch, radius, step, uv,
             warp,
-        )
+        )  # fmt: skip
         self.search_widely()
         curvature = self._curvatures(tracks, self.reference.pose, pose)
         return self._kept(tracks, *self._align(pyramid, uv, warp, curvature, tracks.slot, ncc > MIN_COARSE_NCC))
@@ -305,10 +298,3 @@ def _agreement(found: F64, wanted: F64, cells_needed: float) -> float:
     """The share of the cells (N,) in which as many points are found as wanted; one with many counts no more."""
     weight = 1.0 / np.maximum(wanted, CELL_POINTS)
     return float((weight * np.minimum(found, wanted)).sum() / max((weight * wanted).sum(), cells_needed))
-
-
-def _mask(rows: I64, count: int) -> Bool:
-    """(count,) True at the rows."""
-    mask = np.zeros(count, bool)
-    mask[rows] = True
-    return mask

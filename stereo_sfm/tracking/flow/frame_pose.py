@@ -36,8 +36,6 @@ from stereo_sfm.types import F64, Bool
 # In sigmas, one Gauss-Newton step each. The last are narrow: points that disagree by two or three sigmas (corners where
 # a near edge crosses a far one, people who walk along) have one-sided errors, which bias the scale.
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
-REAPPEARED_NOISE = 1.0  # over config.sigma_px, at least: windows that changed much are found less exactly
-BLURRED_NOISE = 2.0  # the same for windows in a blurred image
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 10.0)  # over config.sigma_px: the noise of the best images, and what still is a match
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
@@ -57,7 +55,6 @@ CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
 KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
-NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
 MIN_DEPTH_SIGMA = 1e-3  # relative
@@ -147,7 +144,7 @@ class FramePoseSolver:
         """Solve for the pose of a lost camera from points that were static before, starting at the expected pose."""
         if len(tracks) < self._config.min_features:
             return no_pose(len(tracks), "too_few_points")
-        with self._noise_of_at_least(REAPPEARED_NOISE):
+        with self._noise_of_at_least(1.0):  # windows that changed much are found less exactly
             return self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
 
     def solve(
@@ -159,7 +156,7 @@ class FramePoseSolver:
         searched for, and the one that the points tracked longest support is the camera's. `blurred`: the image is.
         """
         if blurred:
-            with self._noise_of_at_least(BLURRED_NOISE):
+            with self._noise_of_at_least(2.0):
                 return replace(self.solve(tracks, expected, last_pose, before), blurred=True)
         static = ~tracks.moving
         if np.count_nonzero(static) < self._config.min_features:
@@ -265,7 +262,7 @@ class FramePoseSolver:
         other = self._solve_rest(tracks, expected, last_pose, rest)
         agreed = None if best.reason else self._refit(tracks, expected, best, best.inlier & static, static)
         long = tracks.age * expected.seconds >= SURE_S
-        near = self._errors(tracks, expected.pose, expected.velocity) < NEAR * self._config.max_error_sigmas
+        near = self._errors(tracks, expected.pose, expected.velocity) < 2.0 * self._config.max_error_sigmas
         by_static, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (long, near))
         found = [agreed, by_static, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]

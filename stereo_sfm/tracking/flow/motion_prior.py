@@ -22,8 +22,6 @@ RETURN_S, SPREAD = np.array([4.0, 1.0]), np.array([0.8, 0.7])
 FIRST_SIGMAS = np.array([0.01, 0.005])  # metres, radians: of the last trusted pose and its velocity
 STEADY = np.array([0.05, 0.05])  # m/s, rad/s, standard deviations of a motion that goes on as before
 TURN_STEP = np.deg2rad(20.0)  # radians between turns that are tried
-SLOWER = 0.5, 0.0  # shares of the last speed that are tried
-TURNS = 2.0  # standard deviations of the turn up to which turns are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +101,10 @@ class MotionPrior:
         upright: a robot turns about its y axis.
         """
         forward = self._forward() * RETURN_S[0] * -math.expm1(-self._seconds(stamp_ns) / RETURN_S[0])
-        most = min(TURNS * self.expect(stamp_ns).sigma_rad, math.pi)
+        most = min(2.0 * self.expect(stamp_ns).sigma_rad, math.pi)  # turn that is tried, in both directions
         turns = np.arange(TURN_STEP, most + 0.5 * TURN_STEP, TURN_STEP)
         arcs = [(1.0, side * turn) for turn in turns.tolist() for side in (1.0, -1.0)]
-        motions = [(1.0, 0.0), *((speed, 0.0) for speed in SLOWER), *arcs]
+        motions = [(1.0, 0.0), (0.5, 0.0), (0.0, 0.0), *arcs]  # shares of the last speed, turns
         return [self._poses[-1][1] @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]
 
     def _seconds(self, stamp_ns: int) -> float:

@@ -57,7 +57,7 @@ class SideViews:
         self._min_z = np.cos(np.deg2rad(config.tracker.max_angle_deg))
         self._focal = min(FOCAL * rig.left.fx, MAX_FOCAL_PX)
         self._left_mask = None if rig.left_mask is None else rig.left_mask.astype(np.uint8)
-        self._last: tuple[int, F64, float] | None = None  # newest: submap, odom_T_cam, distance to the shelves
+        self._last: tuple[int, F64, float] | None = None  # newest: submap, odom_T_cam, metres to the shelves
 
     @staticmethod
     def from_config(config: Config, rig: Rig) -> SideViews | None:
@@ -82,7 +82,8 @@ class SideViews:
             return Corners.none()
         points = corners.points_cam.astype(np.float64)
         camera_R_shelves = self._shelf_axes(points)
-        self._last = submap_id, odom_T_cam, _lateral_distance(points @ camera_R_shelves)
+        across = np.abs((points @ camera_R_shelves)[:, 0])
+        self._last = submap_id, odom_T_cam, float(np.median(across)) if len(points) else 0.0
         views = [self._view(camera_R_shelves, side) for side in (1.0, -1.0)]
         parts = [self._corners(left, right, view) for view in views if view is not None]
         return Corners.joined(parts)
@@ -163,8 +164,3 @@ def _interpolated(nodes):
                     rows[i * step + y, j * step + x] = v0 + across * (v1 - v0)
                     seen[i * step + y, j * step + x] = 1
     return columns, rows, seen
-
-
-def _lateral_distance(points: F64) -> float:
-    """Median lateral distance in metres of points (N, 3) with x across; 0 without points."""
-    return float(np.median(np.abs(points[:, 0]))) if len(points) else 0.0

@@ -26,7 +26,7 @@ from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64
 
-MIN_POINTS = 20  # common to two images, seen by both cameras: as many as a keyframe's window needs
+MIN_POINTS = 20  # common to two images, seen by both cameras: in a window they leave seven rows for each unknown
 STEPS, SCALE = 8, 2.0  # of the robust estimate; its scale over the median deviation of the points ...
 LEAST_PX = 1e-3  # ... and what it is at least
 # Of a sudden rotation: one is looked for in each image. With 3.5, one sequence of fifteen has a false one; with 7, the

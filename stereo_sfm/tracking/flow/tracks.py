@@ -49,7 +49,10 @@ class Tracks:
 
     def keep(self, mask: Bool) -> Tracks:
         """The rows where `mask` is True."""
-        rows = np.flatnonzero(mask)  # once: numpy would look for them in each column, in four times the time
+        return self.take(np.flatnonzero(mask))  # once: numpy would look for them in each column, in four times the time
+
+    def take(self, rows: I64) -> Tracks:
+        """These rows."""
         return Tracks(*[column.take(rows, 0) for column in _columns(self)])
 
     def append(self, other: Tracks) -> Tracks:
