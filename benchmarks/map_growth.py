@@ -97,7 +97,7 @@ def insertions() -> None:
     new: list[I64] = []
     times: list[float] = []
     base = process.memory_info().rss
-    names = ("keyframes", "points", "sightings", "median ms", "p99 ms", "MiB", "RSS MiB")
+    names = ("keyframes", "points", "sightings", "median ms", "p99 ms", "RSS MiB")
     print("".join(f"{name:>11}" for name in names))
     for k in range(SIZES[-1]):
         old = rng.permutation(seen[-1])[:TRACKED] if seen else np.zeros(0, np.int64)
@@ -114,7 +114,7 @@ def insertions() -> None:
             rss = (process.memory_info().rss - base) / 2**20
             print(
                 f"{k + 1:11d}{len(map_.points):11d}{len(map_.observations):11d}{np.median(last):11.2f}"
-                f"{np.percentile(last, 99):11.2f}{map_.nbytes / 2**20:11.1f}{rss:11.1f}",
+                f"{np.percentile(last, 99):11.2f}{rss:11.1f}",
                 flush=True,
             )
     print(f"worst insertion {max(times[10:]):.1f} ms (a column doubled), {sum(times) / 1e3:.1f} s for all")

@@ -240,11 +240,6 @@ class Corners(Message):
     def __len__(self) -> int:
         return len(self.uv_left)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all columns."""
-        return self.uv_left.nbytes + self.uv_right.nbytes + self.points_cam.nbytes + self.descriptors.nbytes
-
 
 @dataclass(frozen=True, eq=False)
 class InertialLink(Message):

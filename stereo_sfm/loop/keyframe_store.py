@@ -6,8 +6,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from stereo_sfm.mapping.columns import FEW, SPARE, Columns, column
-from stereo_sfm.mapping.id_rows import IdRows
+from stereo_sfm.mapping.columns import FEW, SPARE, Columns, IdRows, column
 from stereo_sfm.types import I32, I64, Keyframe
 
 

@@ -29,7 +29,6 @@ from stereo_sfm.types import F64, I64, Bool
 
 LONGEST_STEP = 32.0  # steps of Gauss-Newton that `BundleConfig.extend` tries at once: five doublings, then a new system
 LEAST_SQUARES = 100.0  # squared scale of Cauchy's loss over twice the variance: the mean weight is one within a percent
-MEDIAN_CHI2 = 2.0 * float(np.log(2.0))  # sigmas^2, of two dimensions
 TO_SIGMA = 1.4826  # from the median of absolute values, of normally distributed ones: 1 / Phi^-1(3/4)
 MIN_RESIDUAL = 0.05  # sigmas, lower bound of a median residual: exact data have none, and a scale of zero
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
@@ -78,7 +77,6 @@ class BundleResult:
     world_T_kf: F64  # (K, 4, 4)
     points: F64  # (P, 3)
     inlier: Bool  # (M, 2) per image; False also where not observed
-    chi2: F64  # (M, 2) squared normalised residuals at the end, of outliers too; 0 where not observed
     cost: float  # robust cost over the inliers at the end
     initial_cost: float  # the same function at the start of the last round
     iterations: int  # accepted steps
@@ -213,17 +211,13 @@ class _Solver:
             state.pull, cost = self.model.evaluate(state.rot[self.moving], state.pos[self.moving])
             state.cost += cost
 
-    def _weigh_disparities(self, state: _State) -> None:
-        """Give less weight to the disparities of points whose mean error is large, see `_disparity_weights`."""
-        total, information = np.zeros(len(state.points)), np.zeros(len(state.points))
-        for table in (self.table, self.fixed):
-            table.add_disparity_errors(state, total, information)
-        self.table.trust = self.fixed.trust = _disparity_weights(total, information, self.config.disparity_sigmas)
-
     def begin_round(self, state: _State, judge: bool) -> None:
         """Linearise anew without outliers; `judge`: determine outliers, in all rounds but the first."""
         if judge and self._weighs_disparities:  # not at the start, where wrong poses make all points disagree
-            self._weigh_disparities(state)
+            total, information = np.zeros(len(state.points)), np.zeros(len(state.points))
+            for table in (self.table, self.fixed):
+                table.add_disparity_errors(state, total, information)
+            self.table.trust = self.fixed.trust = _disparity_weights(total, information, self.config.disparity_sigmas)
         self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
         if judge and self.config.cauchy > 0:
             residual = np.sqrt(median(state.lin[3][self.table.use])) if self.table.use.any() else 0.0
@@ -269,17 +263,12 @@ class _Solver:
         )
         return self.system.solve(matrix, b)
 
-    def _point_blocks(self, state: _State, damping: float) -> tuple[F64, F64]:
-        """Inverse blocks and right sides of the points."""
-        h, g = self.table.sum_up(state.rot, state.lin)
-        prior = state.prior
-        kernels.point_blocks(state.points, prior.x0, prior.h, prior.g, damping, h, g)
-        return h, g
-
     def step(self, state: _State, damping: float) -> _State | None:
         """The state after one damped step, or None if the system has no solution."""
-        rot, pos, points = state.rot, state.pos, state.points
-        blocks = None if self.points_stay else self._point_blocks(state, damping)
+        rot, pos, points, prior = state.rot, state.pos, state.points, state.prior
+        blocks = None if self.points_stay else self.table.sum_up(rot, state.lin)
+        if blocks is not None:
+            kernels.point_blocks(points, prior.x0, prior.h, prior.g, damping, *blocks)
         xi = np.zeros((0, 6))
         if len(self.moving):
             solved = self._solve_poses(state, damping, blocks)
@@ -291,7 +280,7 @@ class _Solver:
             points, table = np.empty_like(points), self.table
             view = table.starts, table.kf, self.free, state.rot, state.lin
             kernels.point_steps(*view, *blocks, xi, state.points, points)
-        return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
+        return self.evaluate(_State(rot, pos, points), prior if self.config.fixed_once else None)
 
     def _extended(self, state: _State, trial: _State) -> _State:
         """The best of ever longer steps from one state towards another, which has a lower cost.
@@ -343,7 +332,7 @@ def counted_information(chi2: float, cauchy: float = 0.0, joint: bool = False) -
         chi2: median squared residual of an image, sigmas^2. cauchy: scale c in sigmas, 0: another loss.
         joint: one loss over both images.
     """
-    variance = max(chi2 / MEDIAN_CHI2, MIN_RESIDUAL**2)
+    variance = max(chi2 / (2.0 * math.log(2.0)), MIN_RESIDUAL**2)  # chi-squared of two dimensions has that median
     a = cauchy**2 / (2.0 * variance)
     if cauchy <= 0 or a > LEAST_SQUARES:
         return min(variance, 1.0)
@@ -432,9 +421,8 @@ def adjust_pose(
 def _result(
     solver: _Solver, bundle: Bundle, state: _State, initial: float, iterations: int, converged: bool
 ) -> BundleResult:
-    inlier, chi2 = np.empty((len(bundle.obs_kf), 2), bool), np.empty((len(bundle.obs_kf), 2))
+    inlier = np.empty((len(bundle.obs_kf), 2), bool)
     for table, found in ((solver.table, state.lin[3]), (solver.fixed, solver.fixed.linearize(state)[0][3])):
-        chi2[table.rows] = found
         inlier[table.rows] = table.agreeing(found, solver.config.outlier_chi2)
     poses = bundle.world_T_kf.astype(float, copy=True)
     moved = se3.from_rotation_translation(state.rot, state.pos)[solver.moving]
@@ -442,7 +430,7 @@ def _result(
     states = None
     if (model := solver.model) is not None and model.states is not None:
         states = model.states.after(model.step_to(state.rot[solver.moving], state.pos[solver.moving]))
-    return BundleResult(poses, state.points, inlier, chi2, state.cost, initial, iterations, converged, states)
+    return BundleResult(poses, state.points, inlier, state.cost, initial, iterations, converged, states)
 
 
 def _check(bundle: Bundle) -> None:

@@ -1,11 +1,13 @@
-"""Tables of growing columns: one array per column, appended in amortised constant time."""
+"""Tables of growing columns: one array per column, appended in amortised constant time; rows of a table by id."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
+
+from stereo_sfm.types import I32, I64, Bool
 
 Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
 SPARE = 4  # one spare row for so many in use: rows are copied four times on the way, and little memory is unused
@@ -55,7 +57,7 @@ class Columns:
         self._show()
         return slice(first, last)
 
-    def keep(self, rows: NDArray[np.int64]) -> None:
+    def keep(self, rows: I64) -> None:
         """Only these rows stay, in this order."""
         for name, data in self._data.items():
             kept = np.empty((max(len(rows) + len(rows) // SPARE, 64), *data.shape[1:]), data.dtype)
@@ -68,7 +70,30 @@ class Columns:
         """Whether more rows than are spared for growth anyway, and not only a few, are not among those `used`."""
         return len(self) > used + used // SPARE + FEW
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the arrays, spare rows included."""
-        return sum(data.nbytes for data in self._data.values())
+
+class IdRows:
+    """Which row each id has that is known for a while. Its size follows the number of known ids, not the highest."""
+
+    def __init__(self) -> None:
+        self.ids: I64 = np.zeros(0, np.int64)  # ascending
+        self.rows: I32 = np.zeros(0, np.int32)  # of each of them; may be written to
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def find(self, ids: I64) -> I64:
+        """(N,) row of each id, -1 for an unknown one."""
+        if not len(self.ids):
+            return np.full(len(ids), -1, np.int64)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return np.where(self.ids[at] == ids, self.rows[at], -1).astype(np.int64)
+
+    def add(self, ids: I64, rows: I64) -> None:
+        """Add unknown ids (N,), each of them once, with their rows (N,)."""
+        order = np.argsort(ids)
+        at = np.searchsorted(self.ids, ids[order])
+        self.ids, self.rows = np.insert(self.ids, at, ids[order]), np.insert(self.rows, at, rows[order])
+
+    def keep(self, known: Bool) -> None:
+        """Forget all ids but those marked (N,)."""
+        self.ids, self.rows = self.ids[known], self.rows[known]

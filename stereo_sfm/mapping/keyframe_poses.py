@@ -36,11 +36,8 @@ class KeyframePoses:
 
     def all(self) -> dict[int, F64]:
         """map_T_kf (4, 4) by id, ascending, without keyframes whose reference keyframe is unknown."""
-        if self._all is None:
-            self._all = self._put_together()
-        return self._all
-
-    def _put_together(self) -> dict[int, F64]:
+        if self._all is not None:
+            return self._all
         out = dict(self._poses)
         for kf_id in self._moves_with:
             way, at = list[int](), kf_id
@@ -51,4 +48,5 @@ class KeyframePoses:
                 for k in reversed(way):
                     reference, reference_T_kf = self._moves_with[k]
                     out[k] = out[reference] @ reference_T_kf
-        return dict(sorted(out.items()))
+        self._all = dict(sorted(out.items()))
+        return self._all

@@ -17,7 +17,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
-from stereo_sfm.mapping.id_rows import IdRows
+from stereo_sfm.mapping.columns import IdRows
 from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
@@ -496,12 +496,3 @@ class Map:
             corner_descriptors=corners.descriptors,
             corner_side=np.repeat(np.tile([False, True], len(kfs)), counts.ravel()),
         )
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all columns, of corners and of what IMU and wheels measured."""
-        tables = (self.keyframes, self.points, self.observations)
-        corners = sum(c.nbytes for both in self.corners.values() for c in both)
-        sensors = sum(motion.nbytes for motion in self.motions.values())
-        sensors += sum(array.nbytes for state in self.known_states.values() for array in state)
-        return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners + sensors

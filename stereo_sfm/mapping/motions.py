@@ -39,12 +39,6 @@ class Motion:
             )  # fmt: skip
         return _unless_empty(inertial, wheels, keyframe.odometry if odometry else None)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of its arrays."""
-        parts = [vars(part).values() for part in (self.inertial, self.wheels, self.odometry) if part is not None]
-        return sum(value.nbytes for values in parts for value in values if isinstance(value, np.ndarray))
-
     def then(self, following: Motion) -> Motion | None:
         """Over both; None if one of them or the whole says nothing."""
         first, second = self.inertial, following.inertial

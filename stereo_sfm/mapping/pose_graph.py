@@ -54,7 +54,6 @@ class PoseGraphResult:
 
     poses: F64  # (K, 4, 4)
     weights: F64  # (E,) 1 for edges of the odometry, in [0, 1] for loops
-    error: float
 
 
 def join(edges: list[Edges]) -> Edges:
@@ -67,10 +66,7 @@ def edges_of_poses(poses: F64, i: I64, j: I64, metres_per_metre: float, radians_
     relative = se3.inverse(poses[i]) @ poses[j]
     length = np.linalg.norm(relative[:, :3, 3], axis=1)
     turn = np.linalg.norm(se3.log(relative)[:, 3:], axis=1) if len(i) else np.zeros(0)
-    sigmas = np.stack(
-        [0.001 + metres_per_metre * length, 0.0002 + radians_per_metre * length + 0.002 * turn],
-        axis=1,
-    )
+    sigmas = np.stack([0.001 + metres_per_metre * length, 0.0002 + radians_per_metre * length + 0.002 * turn], axis=1)
     return Edges(i, j, relative, sigmas, np.zeros(len(i), bool))
 
 
@@ -99,12 +95,13 @@ def optimise(
         result, weights = _levenberg(gtsam, plain, values), np.ones(len(edges))
         if robust == "switchable" and edges.loop.any():  # start from least squares: no true loop is far off
             result = _levenberg(gtsam, _graph(gtsam, edges, fixed, values, robust=True, gravity=gravity), result)
-            loops = np.flatnonzero(edges.loop)
-            weights[loops] = [_switch(2 * plain.at(int(e)).error(result)) for e in loops]
+            for e in np.flatnonzero(edges.loop).tolist():  # the weight that the scaling gives to a squared error
+                chi2 = 2 * plain.at(e).error(result)
+                weights[e] = min(1.0, 2 * chi_squared(6) / (chi_squared(6) + chi2)) ** 2
     out = poses.copy()
     for row in used.tolist():
         out[row] = result.atPose3(row).matrix()
-    return PoseGraphResult(out, weights, float(plain.error(result)))
+    return PoseGraphResult(out, weights)
 
 
 def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool, gravity: Gravity | None) -> Any:
@@ -155,8 +152,3 @@ def _graduated(gtsam: Any, graph: Any, values: Any, edges: Edges) -> tuple[Any, 
     optimizer.setInlierCostThresholdsAtProbability(0.999)
     result = optimizer.optimize()
     return result, np.where(edges.loop, np.asarray(optimizer.getWeights())[: len(edges)], 1.0)
-
-
-def _switch(chi2: float) -> float:
-    """Weight that dynamic covariance scaling gives to a squared error."""
-    return min(1.0, 2 * chi_squared(6) / (chi_squared(6) + chi2)) ** 2

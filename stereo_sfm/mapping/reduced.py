@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
-from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIssue, reportUnknownVariableType]
 from scipy.sparse.linalg import splu
 
 from stereo_sfm.mapping import bundle_kernels
-from stereo_sfm.types import F64, I64
+from stereo_sfm.types import F64, I32, I64
 
 DENSE_KEYFRAMES = 300  # above, the sparse factorisation is faster (benchmarks/full_ba.py --solvers)
 
@@ -33,22 +32,18 @@ class ReducedSystem:
         seen = np.diff(np.append(0, np.cumsum(free[obs_kf] >= 0))[starts])  # (P,) free keyframes of every point
         self.most, keys = int(seen.max(initial=0)), np.empty(int((seen * (seen + 1) // 2).sum()), np.int64)
         bundle_kernels.list_pairs(starts, obs_kf, free, n, keys)
+        self.slots: I32  # block of every pair, in that order
         diagonal = np.arange(n, dtype=np.int64) * (n + 1)
         if self.dense:
-            self.count, self._slots, self._diagonal = n * n, keys.astype(np.int32), diagonal
+            self.count, self.slots, self._diagonal = n * n, keys.astype(np.int32), diagonal
             return
         unique, slots = np.unique(np.concatenate([diagonal, keys]), return_inverse=True)
-        self.count, self._slots, self._diagonal = len(unique), slots[n:].astype(np.int32), slots[:n]
+        self.count, self.slots, self._diagonal = len(unique), slots[n:].astype(np.int32), slots[:n]
         rows, cols = np.divmod(unique, n)
         self._lower = np.flatnonzero(rows != cols)  # blocks that stand above the diagonal, too, transposed
         columns, rows = np.append(cols, rows[self._lower]), np.append(rows, cols[self._lower])
         self._order = np.lexsort((rows, columns))
         self._rows, self._starts = rows[self._order], np.searchsorted(columns[self._order], np.arange(n + 1))
-
-    @property
-    def slots(self) -> NDArray[np.int32]:
-        """Block of every pair in the order of bundle_kernels.list_pairs."""
-        return self._slots
 
     def new_blocks(self, pose_blocks: F64) -> F64:
         """(B, 6, 6) zeros, with the (F, 6, 6) blocks of the poses on the diagonal."""
@@ -58,20 +53,15 @@ class ReducedSystem:
 
     def solve(self, blocks: F64, b: F64) -> F64 | None:
         """(F, 6) step; None where the dense matrix is not positive definite, or the sparse one singular."""
-        return self._solve_dense(blocks, b) if self.dense else self._solve_sparse(blocks, b)
-
-    def _solve_sparse(self, blocks: F64, b: F64) -> F64 | None:
+        n = self.size
+        if self.dense:
+            columns = blocks.reshape(n, n, 6, 6).transpose(1, 3, 0, 2).reshape(6 * n, 6 * n)  # as LAPACK has them
+            _, step, failed = dposv(columns.T, b.ravel(), lower=1, overwrite_a=1)
+            return None if failed else step.reshape(n, 6)
         both = np.concatenate([blocks, blocks[self._lower].mT])[self._order].mT  # of the transpose, by rows
-        shape = (6 * self.size,) * 2
-        matrix = scipy.sparse.bsr_array((both, self._rows, self._starts), shape=shape).tocsr().T
+        matrix = scipy.sparse.bsr_array((both, self._rows, self._starts), shape=(6 * n, 6 * n)).tocsr().T
         try:  # without pivots, which a positive definite matrix does not need
             factor = splu(matrix, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError:  # singular
             return None
         return factor.solve(b.ravel()).reshape(-1, 6)
-
-    def _solve_dense(self, blocks: F64, b: F64) -> F64 | None:
-        n = self.size
-        columns = blocks.reshape(n, n, 6, 6).transpose(1, 3, 0, 2).reshape(6 * n, 6 * n)  # as LAPACK has them
-        _, step, failed = dposv(columns.T, b.ravel(), lower=1, overwrite_a=1)
-        return None if failed else step.reshape(n, 6)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from stereo_sfm.mapping.id_rows import IdRows
+from stereo_sfm.mapping.columns import IdRows
 
 
 def test_ids_are_found_as_in_a_dictionary() -> None:
@@ -19,4 +19,4 @@ def test_ids_are_found_as_in_a_dictionary() -> None:
         for gone in table.ids[~known].tolist():
             del expected[gone]
         table.keep(known)
-        assert len(table) == len(expected) and table.nbytes == 12 * len(expected)
+        assert len(table) == len(expected) and table.ids.nbytes + table.rows.nbytes == 12 * len(expected)
