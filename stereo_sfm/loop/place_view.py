@@ -52,15 +52,9 @@ def place_view_of(
     uv_left, uv_right = seen_by(rig, own, uv_left, uv_right, points)
     rows = np.flatnonzero(binary.present(descriptors) & (own is rig or rig.left.inside(uv_left)))
     return PlaceView(
-        ids[rows],
-        uv_left[rows],
-        uv_right[rows],
-        points[rows],
-        own.range_sigmas(points[rows], disparity_sigma),
-        descriptors[rows],
-        corner[rows],
-        rows,
-    )
+        ids[rows], uv_left[rows], uv_right[rows], points[rows], own.range_sigmas(points[rows], disparity_sigma),
+        descriptors[rows], corner[rows], rows,
+    )  # fmt: skip
 
 
 def seen_by(rig: Rig, own: Rig, uv_left: F64, uv_right: F64, points: F64) -> tuple[F64, F64]:

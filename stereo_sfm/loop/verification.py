@@ -65,12 +65,9 @@ def verify(
     """
     corners_b, corners_a = np.flatnonzero(view.corner), np.flatnonzero(cloud.corner)
     at_b, at_a = binary.match_descriptors(
-        view.descriptors[corners_b],
-        cloud.descriptors[corners_a],
-        cloud.ids[corners_a],
-        config.max_distance_bits,
+        view.descriptors[corners_b], cloud.descriptors[corners_a], cloud.ids[corners_a], config.max_distance_bits,
         config.match_ratio,
-    )
+    )  # fmt: skip
     rows_b, rows_a = corners_b[at_b], corners_a[at_a]
     if len(rows_b) < max(config.min_match_fraction * len(corners_b), 4):
         return rejection("too_few_matches", len(rows_b))

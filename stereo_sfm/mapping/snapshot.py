@@ -64,11 +64,9 @@ class MapSnapshot:
 
     def _corners(self, rows: slice) -> Corners:
         return Corners(
-            self.corner_uv_left[rows],
-            self.corner_uv_right[rows],
-            self.corner_points[rows],
+            self.corner_uv_left[rows], self.corner_uv_right[rows], self.corner_points[rows],
             self.corner_descriptors[rows],
-        )
+        )  # fmt: skip
 
     def _keyframe(self, k: int, seen: slice, corners: slice) -> Keyframe:
         points, pose = self.obs_pt[seen], self.map_T_kf[k]

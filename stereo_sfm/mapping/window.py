@@ -106,17 +106,11 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     inside = kf_index[table.kf[obs]] >= 0
     obs, obs_pt = obs[inside], obs_pt[inside]
     fixed[_floating(map_, kfs, fixed)] = True
+    uv_left, uv_right, sigma = (column[obs].astype(float) for column in (table.uv_left, table.uv_right, table.sigma))
     bundle = Bundle(
-        map_.keyframes.map_T_kf[kfs],
-        fixed,
-        points.xyz[pts],
-        kf_index[table.kf[obs]],
-        obs_pt,
-        table.uv_left[obs].astype(float),
-        table.uv_right[obs].astype(float),
-        np.repeat(table.sigma[obs].astype(float)[:, None], 2, 1),
-        level_of(map_, kfs, fixed),
-    )
+        map_.keyframes.map_T_kf[kfs], fixed, points.xyz[pts], kf_index[table.kf[obs]], obs_pt, uv_left, uv_right,
+        np.repeat(sigma[:, None], 2, 1), level_of(map_, kfs, fixed),
+    )  # fmt: skip
     return Window(bundle, kfs, len(moving), pts, obs)
 
 

@@ -73,15 +73,9 @@ def update(
         joining.begin(rest)
     joining.adjust()
     snapshot, kept_sessions = joining.content()
-    return Update(
-        SavedMap(in_frame_of(saved.snapshot, snapshot), both.cameras, vocabulary.id, kept_sessions),
-        int(both.sessions[len(saved)]),
-        joining.loops,
-        joining.fused,
-        forgotten,
-        together,
-        sessions,
-    )
+    new = SavedMap(in_frame_of(saved.snapshot, snapshot), both.cameras, vocabulary.id, kept_sessions)
+    number = int(both.sessions[len(saved)])
+    return Update(new, number, joining.loops, joining.fused, forgotten, together, sessions)
 
 
 def without_superseded(together: MapSnapshot, sessions: I64) -> tuple[MapSnapshot, I64]:

@@ -156,13 +156,8 @@ class MonocularTracker(DescriptorTracker):
         fresh = fresh[epipolar_inliers(a, b, 2 * self._odometry.epipolar_px * self._pixel, rng)]
         now_T_kf = se3.inverse(self._odom_T_cam) @ self._odom_T_kf
         # From the new view, so that the points come out in its camera.
-        points = good_points(
-            view.bearings[fresh[:, 1]],
-            self._keyframe.bearings[fresh[:, 0]],
-            now_T_kf,
-            _REPROJECT_PX * self._pixel,
-            np.radians(MIN_PARALLAX_DEG),
-        )
+        rays = view.bearings[fresh[:, 1]], self._keyframe.bearings[fresh[:, 0]]
+        points = good_points(*rays, now_T_kf, _REPROJECT_PX * self._pixel, np.radians(MIN_PARALLAX_DEG))
         positions = se3.transform(se3.inverse(self._odom_T_cam), self._local.positions(view.ids))
         positions[fresh[:, 1]] = points
         view = replace(view, points=positions)

@@ -21,10 +21,7 @@ def translation_for(
     rows = pair.rows_with_points(config.min_inliers)
     sigmas = pair.sigmas[rows]
     translation, consensus = translation_ransac(
-        pair.points_last[rows] @ rotation.T,
-        pair.points_now[rows],
-        thresholds(config, sigmas),
-        rng,
+        pair.points_last[rows] @ rotation.T, pair.points_now[rows], thresholds(config, sigmas), rng,
         weights(config, sigmas),
-    )
+    )  # fmt: skip
     return translation, pair.marked(rows[consensus.inliers])

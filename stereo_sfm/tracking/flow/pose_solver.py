@@ -374,19 +374,8 @@ def shift_chi2(pose, velocity, covariance, points, cameras, sigma, scale):
     n = 12 if len(points.row_s) > 0 else 6
     normal, rhs, inverse, factor = np.zeros((n, n)), np.zeros(n), np.full((6, 6), np.inf), np.zeros((6, 6))
     x = np.zeros(6)
-    normal_equations(
-        pose,
-        velocity,
-        points,
-        points.rho,
-        cameras,
-        sigma,
-        scale,
-        normal,
-        rhs,
-        np.empty(len(points.rho)),
-        np.empty((len(points.rho), 7)),
-    )
+    error, elimination = np.empty(len(points.rho)), np.empty((len(points.rho), 7))
+    normal_equations(pose, velocity, points, points.rho, cameras, sigma, scale, normal, rhs, error, elimination)
     if not invert_symmetric(covariance, inverse, factor):
         return math.inf
     if n == 12:  # the velocity is unknown
