@@ -149,7 +149,7 @@ class StereoMatcher:
         """Right pixels (N, 2), accurate to a pixel of the search level, NaN without a match."""
         return search_epipolar(
             left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, self._cameras, self._min_depth,
-            self._candidates, 25.0, 1.2,
+            self._candidates,
         )  # fmt: skip
 
     def _usual_sigma(self, uv: F64) -> F64:

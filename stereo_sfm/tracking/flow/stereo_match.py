@@ -139,14 +139,14 @@ def _costs(right, right_sums, pixels, templates, cost):
 
 
 @njit
-def _clear_best(where, cost, uv, scale, max_cost, ratio, out):
+def _clear_best(where, cost, uv, scale, out):
     """Write the position (N, 2) with the least cost where the second best, away from it, is clearly worse."""
     for k in range(len(uv)):
         best, best_index = 1e9, -1
         for c in range(cost.shape[1]):
             if cost[k, c] < best:
                 best, best_index = cost[k, c], c
-        if best_index < 0 or best > max_cost:
+        if best_index < 0 or best > 25.0:  # grey levels a pixel
             continue
         bu, bv = where[k, best_index, 0], where[k, best_index, 1]
         second = 1e9
@@ -155,22 +155,14 @@ def _clear_best(where, cost, uv, scale, max_cost, ratio, out):
                 du, dv = where[k, c, 0] - bu, where[k, c, 1] - bv
                 if du * du + dv * dv > (3.0 * scale) ** 2:
                     second = cost[k, c]
-        if second < ratio * best + 0.5:
+        if second < 1.2 * best + 0.5:
             continue
         out[k, 0] = bu + uv[k, 0] - int(round(uv[k, 0] / scale)) * scale
         out[k, 1] = bv + uv[k, 1] - int(round(uv[k, 1] / scale)) * scale
 
 
 def search_epipolar(
-    left: U8,
-    right: U8,
-    uv: F64,
-    scale: float,
-    cameras: StereoCameras,
-    min_depth: float,
-    candidates: int,
-    max_cost: float,
-    ratio: float,
+    left: U8, right: U8, uv: F64, scale: float, cameras: StereoCameras, min_depth: float, candidates: int
 ) -> F64:
     """Coarse position in the right image of points of the left one.
 
@@ -179,8 +171,7 @@ def search_epipolar(
     Args:
         left, right: (H, W) uint8, one pyramid level whose pixels are `scale` pixels of the full image.
         uv: (N, 2) px of the full left image. min_depth: metres, nearest distance searched.
-        candidates: how many inverse distances. max_cost: grey levels a pixel. ratio: the second best cost, away from
-            the best, must be at least this much larger.
+        candidates: how many inverse distances.
 
     Returns:
         (N, 2) px of the full right image, NaN without a clear best.
@@ -191,7 +182,7 @@ def search_epipolar(
     sums = cv2.boxFilter(right, cv2.CV_32S, (SIZE, SIZE), normalize=False).astype(np.int32, copy=False)
     _candidates(left, right.shape, uv, scale, cameras, min_depth, where, pixels, templates)
     _costs(right, sums, pixels, templates, cost)
-    _clear_best(where, cost, uv, scale, max_cost, ratio, out)
+    _clear_best(where, cost, uv, scale, out)
     return out
 
 

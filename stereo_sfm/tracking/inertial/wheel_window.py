@@ -124,19 +124,14 @@ class WheelWindow:
 
     def doubt(self, seconds: float, by_wheels: float, turned: float) -> float:
         """The share of the way that is in doubt: what is expected of a calibration while the robot turns, more where
-        wheels turn (rad) otherwise than others say."""
+        wheels slip: they turn (rad, in about half a second) otherwise than others say. Skid-steer slips in all turns.
+        """
         if abs(turned) < STRAIGHT * seconds:
             return 0.0
-        return max(self._slip, float(self.slip_share(by_wheels, turned)))
-
-    def slip_share(self, by_wheels: F64 | float, turned: F64 | float) -> F64 | float:
-        """The share of the way that wheels slipped, by turns (rad) of about half a second that they and others say.
-
-        0 for skid_steer, which slips in all turns.
-        """
-        off = np.abs(by_wheels - turned)
-        share = np.minimum(off / np.maximum(np.abs(by_wheels), TURN_FREE[0]), 1.0)
-        return np.where(self._rigid & (off > TURN_FREE[0] + TURN_FREE[1] * np.abs(turned)), share, 0.0)
+        off = abs(by_wheels - turned)
+        if not (self._rigid and off > TURN_FREE[0] + TURN_FREE[1] * abs(turned)):
+            return self._slip
+        return max(self._slip, min(off / max(abs(by_wheels), TURN_FREE[0]), 1.0))
 
     def _turn(self) -> tuple[float, float, float]:
         """Scale of turns, its standard deviation, and the variance of what is left of a link's turn."""
