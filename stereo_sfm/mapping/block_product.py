@@ -12,7 +12,7 @@ from numba import types
 from numba.extending import intrinsic
 
 # Types of the compiler: a number of an entry, six entries, six numbers of entries.
-INDEX, ROW, FIRST = ir.IntType(64), ir.VectorType(ir.DoubleType(), 6), ir.VectorType(ir.IntType(32), 6)
+Index, Row, First = ir.IntType(64), ir.VectorType(ir.DoubleType(), 6), ir.VectorType(ir.IntType(32), 6)
 
 
 @intrinsic
@@ -24,8 +24,8 @@ def subtract_product(_, a, m, b, n, blocks, slot):
         first, second, third = (context.make_array(kinds[k])(context, builder, arguments[k]).data for k in (0, 2, 4))
 
         def row(data, index, size, k):
-            place = builder.gep(data, [builder.add(builder.mul(index, INDEX(size)), INDEX(6 * k))])
-            return builder.bitcast(place, ROW.as_pointer())
+            place = builder.gep(data, [builder.add(builder.mul(index, Index(size)), Index(6 * k))])
+            return builder.bitcast(place, Row.as_pointer())
 
         factors = [builder.load(row(second, arguments[3], 18, c), align=8) for c in range(3)]
         entries = [builder.load(row(first, arguments[1], 18, c), align=8) for c in range(3)]
@@ -33,7 +33,7 @@ def subtract_product(_, a, m, b, n, blocks, slot):
         for k in range(6):
             total = None
             for c in range(3):
-                entry = builder.shuffle_vector(entries[c], ROW(ir.Undefined), FIRST([k] * 6))
+                entry = builder.shuffle_vector(entries[c], Row(ir.Undefined), First([k] * 6))
                 product = builder.fmul(entry, factors[c])
                 total = product if total is None else builder.fadd(total, product)
             builder.store(builder.fsub(builder.load(rows[k], align=8), total), rows[k], align=8)

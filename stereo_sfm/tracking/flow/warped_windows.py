@@ -10,27 +10,27 @@ from numba import types
 from numba.extending import intrinsic
 
 from stereo_sfm.geometry.kernels import inner
-from stereo_sfm.tracking.flow.windows import FLOATS, INDEX, SIZE, STRIDE, lanes
+from stereo_sfm.tracking.flow.windows import SIZE, STRIDE, Floats, Index, lanes
 
 HALF = 7.5  # from the centre of a window to its first sample
 MAX_REACH = 60.0  # px from the centre of a warped window
 # Types of the generated code.
-WORD, WORDS = ir.IntType(32), ir.VectorType(ir.IntType(32), SIZE)
+Word, Words = ir.IntType(32), ir.VectorType(ir.IntType(32), SIZE)
 
 
 def _splat(builder, value, kind):
     """A vector of one value."""
     none = kind(ir.Undefined)
-    return builder.shuffle_vector(builder.insert_element(none, value, INDEX(0)), none, lanes([0] * SIZE))
+    return builder.shuffle_vector(builder.insert_element(none, value, Index(0)), none, lanes([0] * SIZE))
 
 
 def _gathered(builder, data, first, index):
     """The four pixels from each of SIZE pixels on, each in one word."""
-    words = WORDS(ir.Undefined)
+    words = Words(ir.Undefined)
     for k in range(SIZE):
-        at = builder.add(first, builder.sext(builder.extract_element(index, INDEX(k)), INDEX))
-        place = builder.bitcast(builder.gep(data, [at]), WORD.as_pointer())
-        words = builder.insert_element(words, builder.load(place, align=1), INDEX(k))
+        at = builder.add(first, builder.sext(builder.extract_element(index, Index(k)), Index))
+        place = builder.bitcast(builder.gep(data, [at]), Word.as_pointer())
+        words = builder.insert_element(words, builder.load(place, align=1), Index(k))
     return words
 
 
@@ -47,27 +47,27 @@ def _interpolate(_, image, first, width, start, step, out, to):
         source, first, width, start, step, target, to = arguments
         source = context.make_array(signature.args[0])(context, builder, source).data
         target = context.make_array(signature.args[5])(context, builder, target).data
-        x = FLOATS([k - HALF for k in range(SIZE)])
+        x = Floats([k - HALF for k in range(SIZE)])
         whole, share = list[ir.Value](), list[ir.Value]()
         for k in range(2):
-            begin, slope = (_splat(builder, builder.extract_value(pair, k), FLOATS) for pair in (start, step))
+            begin, slope = (_splat(builder, builder.extract_value(pair, k), Floats) for pair in (start, step))
             place = builder.fadd(builder.fmul(slope, x), begin)
-            whole.append(builder.fptosi(place, WORDS))
-            share.append(builder.fsub(place, builder.sitofp(whole[k], FLOATS)))
-        index = builder.add(builder.mul(whole[1], _splat(builder, width, WORDS)), whole[0])
+            whole.append(builder.fptosi(place, Words))
+            share.append(builder.fsub(place, builder.sitofp(whole[k], Floats)))
+        index = builder.add(builder.mul(whole[1], _splat(builder, width, Words)), whole[0])
         upper = _gathered(builder, source, first, index)
         # From two pixels further left: the last pixel of the image is the last of a word.
-        lower = _gathered(builder, source, builder.add(first, builder.sext(builder.sub(width, WORD(2)), INDEX)), index)
+        lower = _gathered(builder, source, builder.add(first, builder.sext(builder.sub(width, Word(2)), Index)), index)
 
         def pixels(words, k):
-            byte = builder.and_(builder.lshr(words, WORDS([8 * k] * SIZE)), WORDS([255] * SIZE))
-            return builder.sitofp(byte, FLOATS)
+            byte = builder.and_(builder.lshr(words, Words([8 * k] * SIZE)), Words([255] * SIZE))
+            return builder.sitofp(byte, Floats)
 
         def between(a, b, share):
             return builder.fadd(a, builder.fmul(share, builder.fsub(b, a)))
 
         rows = [between(pixels(words, k), pixels(words, k + 1), share[0]) for words, k in ((upper, 0), (lower, 2))]
-        place = builder.bitcast(builder.gep(target, [to]), FLOATS.as_pointer())
+        place = builder.bitcast(builder.gep(target, [to]), Floats.as_pointer())
         builder.store(between(*rows, share[1]), place, align=4)
         return context.get_dummy_value()
 

@@ -24,8 +24,8 @@ STRIDE = SIZE + 4  # with the extra columns, a multiple of four
 FLAT_SIZE = SIZE * STRIDE
 WIDE_SIZE = (SIZE + 2) * STRIDE  # with a pixel more all around, for gradients
 # Types of the generated code.
-INDEX = ir.IntType(64)
-BYTES, FLOATS = ir.VectorType(ir.IntType(8), SIZE), ir.VectorType(ir.FloatType(), SIZE)
+Index = ir.IntType(64)
+Bytes, Floats = ir.VectorType(ir.IntType(8), SIZE), ir.VectorType(ir.FloatType(), SIZE)
 
 
 def lanes(numbers):
@@ -48,13 +48,13 @@ def _interpolate(_, image, upper, lower, weights, out, to):
         target = context.make_array(signature.args[4])(context, builder, target).data
         total = None
         for k, row in enumerate((upper_index, upper_index, lower_index, lower_index)):
-            pixels = builder.gep(source, [builder.add(row, INDEX(k % 2))])
-            pixels = builder.load(builder.bitcast(pixels, BYTES.as_pointer()), align=1)
-            weight = builder.insert_element(FLOATS(ir.Undefined), builder.extract_value(four, k), INDEX(0))
-            weight = builder.shuffle_vector(weight, FLOATS(ir.Undefined), lanes([0] * SIZE))
-            product = builder.fmul(weight, builder.uitofp(pixels, FLOATS))
+            pixels = builder.gep(source, [builder.add(row, Index(k % 2))])
+            pixels = builder.load(builder.bitcast(pixels, Bytes.as_pointer()), align=1)
+            weight = builder.insert_element(Floats(ir.Undefined), builder.extract_value(four, k), Index(0))
+            weight = builder.shuffle_vector(weight, Floats(ir.Undefined), lanes([0] * SIZE))
+            product = builder.fmul(weight, builder.uitofp(pixels, Floats))
             total = product if total is None else builder.fadd(total, product)
-        builder.store(total, builder.bitcast(builder.gep(target, [first]), FLOATS.as_pointer()), align=4)
+        builder.store(total, builder.bitcast(builder.gep(target, [first]), Floats.as_pointer()), align=4)
         return context.get_dummy_value()
 
     return types.void(image, types.intp, types.intp, weights, out, types.intp), generate
@@ -71,8 +71,8 @@ def dot(_, a, b):
         )
 
         def part(at):
-            places = (builder.gep(data, [INDEX(at)]) for data in (first, second))
-            return builder.fmul(*(builder.load(builder.bitcast(p, FLOATS.as_pointer()), align=4) for p in places))
+            places = (builder.gep(data, [Index(at)]) for data in (first, second))
+            return builder.fmul(*(builder.load(builder.bitcast(p, Floats.as_pointer()), align=4) for p in places))
 
         def tree(parts):
             while len(parts) > 1:
@@ -88,7 +88,7 @@ def dot(_, a, b):
             size //= 2
             halves = (lanes(list(range(k, k + size))) for k in (0, size))
             total = builder.fadd(*(builder.shuffle_vector(total, total, half) for half in halves))
-        return builder.extract_element(total, INDEX(0))
+        return builder.extract_element(total, Index(0))
 
     return types.float32(a, b), generate
 
