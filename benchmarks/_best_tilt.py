@@ -18,7 +18,7 @@ from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
-from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
+from stereo_sfm.tracking.inertial.series import SampleBuffer
 from stereo_sfm.types import F64, ImuSamples
 
 FIRST_SIGMA = 0.2, 1e-4  # rad of tilt, and of all that is chosen at the start

@@ -15,7 +15,7 @@ from stereo_sfm.config import REMOVED, RENAMED, Config, dump, estimator_names, e
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.pose_graph import ROBUST
 from stereo_sfm.papers.extraction import TABLE as FEATURES
-from stereo_sfm.papers.step_scale import SCALES
+from stereo_sfm.papers.motion_estimator import SCALES
 from stereo_sfm.presets import PRESETS
 from stereo_sfm.settings import walk
 

@@ -20,8 +20,7 @@ from stereo_sfm.papers.descriptor_tracker import DescriptorTracker
 from stereo_sfm.papers.extraction import circle_mask
 from stereo_sfm.papers.feature_view import FeatureView
 from stereo_sfm.papers.matching import epipolar_inliers
-from stereo_sfm.papers.motion_estimator import FramePair, Motion, estimator
-from stereo_sfm.papers.step_scale import StepScale
+from stereo_sfm.papers.motion_estimator import FramePair, Motion, StepScale, estimator
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow.map_points import rows_of
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners

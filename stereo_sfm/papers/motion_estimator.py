@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
 from stereo_sfm.config import OdometryConfig, estimator_names
-from stereo_sfm.errors import one_of
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.types import F64, I64, U8, Bool, Message
+from stereo_sfm.types import F64, I64, U8, Bool, Message, Trajectory
 
+SCALES = ("stereo", "unit", "ground-truth")
 SHIFTS = 8  # random pairings that `refuse_chance` compares with ...
 BETTER_THAN_CHANCE = 3.0  # ... and how many times nearer a motion must bring the points
 
@@ -65,6 +66,35 @@ class Motion(Message):
     inliers: Bool  # (N,) rows of the pair that agree
     metric: bool = True
     stats: dict[str, float] = field(default_factory=dict[str, float])
+
+
+class StepScale:
+    """Length of a step of which only the direction is known: unit steps or ground truth, an explicit choice."""
+
+    def __init__(self, config: OdometryConfig, ground_truth: Trajectory | None) -> None:
+        """Raises:
+        StereoSfmError: unknown scale, or ground truth wanted where there is none.
+        """
+        if config.scale not in SCALES:
+            raise StereoSfmError(f"unknown odometry.scale '{config.scale}': choose one of {', '.join(SCALES)}")
+        if config.scale == "ground-truth" and ground_truth is None:
+            raise StereoSfmError("odometry.scale is ground-truth, but this source has no ground truth: use unit")
+        self._kind = config.scale
+        self._truth = ground_truth
+
+    def metric(self, motion: Motion, last_stamp_ns: int, stamp_ns: int) -> Motion:
+        """The motion with a length; unchanged where it has one."""
+        if motion.metric:
+            return motion
+        step = 1.0
+        if self._kind == "ground-truth" and self._truth is not None:
+            step = float(np.linalg.norm(self._position(stamp_ns) - self._position(last_stamp_ns)))
+        return replace(motion, translation=step * motion.translation, metric=True)
+
+    def _position(self, stamp_ns: int) -> np.ndarray:
+        assert self._truth is not None
+        stamps = self._truth.stamp_ns
+        return np.array([np.interp(stamp_ns, stamps, self._truth.positions[:, k]) for k in range(3)])
 
 
 # Motion between the two frames; raises Degenerate, with a short stable word, where the data do not determine it.

@@ -13,8 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.papers.motion_estimator import FramePair, Motion, estimator
-from stereo_sfm.papers.step_scale import StepScale
+from stereo_sfm.papers.motion_estimator import FramePair, Motion, StepScale, estimator
 from stereo_sfm.types import F64, Trajectory
 from tests.papers.synthetic_views import PIXEL, frame_pair, unit
 

@@ -19,7 +19,7 @@ from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
-from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
+from stereo_sfm.tracking.inertial.series import SampleBuffer
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import F64, I64, Bool, ImuSamples, StereoImage, TrackState
 

@@ -20,8 +20,17 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
-from stereo_sfm.tracking.flow.warped_windows import HALF, sample_affine
-from stereo_sfm.tracking.flow.windows import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, dot, sample, sample_wide
+from stereo_sfm.tracking.flow.windows import (
+    FLAT_SIZE,
+    HALF,
+    SIZE,
+    STRIDE,
+    WIDE_SIZE,
+    dot,
+    sample,
+    sample_affine,
+    sample_wide,
+)
 from stereo_sfm.types import F32, F64, U8
 
 FINE, COARSE = 0.01, 0.1  # px, last step of an alignment: in the image itself, and where a finer one follows

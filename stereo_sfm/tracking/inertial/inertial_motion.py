@@ -16,7 +16,7 @@ from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.rotation_filter import RotationFilter
-from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
+from stereo_sfm.tracking.inertial.series import SampleBuffer
 from stereo_sfm.types import F64, I64, ImuSamples, InertialLink
 
 NODE_NS = 200_000_000  # between the poses of the filter
