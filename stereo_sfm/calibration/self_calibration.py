@@ -37,7 +37,6 @@ KEYFRAMES = 4  # of one window, the last one may have one less; a rotation that 
 MIN_MOTION = 0.02
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case: near ones left the view
 MIN_WINDOWS = 2  # before the first correction: one for each half
-FIRST_KEYFRAMES = 2  # the fewest of a window: a first error is corrected that both halves of their points show
 # Windows that each term needs, in the order in which cameras err: rotation, baseline and focal length, decentering.
 INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
 # For halves of two windows each, twice as many for drift, of which two are unknown. As many as there are, but no more
@@ -113,7 +112,7 @@ class SelfCalibration:
             self._keyframes.append(seen)
         if not moved or turned is not None or self._turned_kf_id >= 0:
             return turned
-        if len(self._keyframes) == FIRST_KEYFRAMES and not (self.windows or self._corrected.any()):
+        if len(self._keyframes) == 2 and not (self.windows or self._corrected.any()):  # the fewest of a window
             return self._at_first_sight()
         if len(self._keyframes) < KEYFRAMES or not self._close_window():
             return None

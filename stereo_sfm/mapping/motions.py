@@ -13,9 +13,8 @@ import numpy as np
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import Preintegrated, preintegrate
+from stereo_sfm.tracking.inertial.motion_sensors import INERTIAL_S
 from stereo_sfm.types import F64, Keyframe, MotionLink
-
-LONGEST_S = 10.0  # seconds of a motion by the IMU: its positions drift with the square of the time, and say little then
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,7 @@ class Motion:
         """Over both; None if one of them or the whole says nothing."""
         first, second = self.inertial, following.inertial
         inertial = None if first is None or second is None else first.then(second)
-        if inertial is not None and inertial.seconds > LONGEST_S:
+        if inertial is not None and inertial.seconds > INERTIAL_S:
             return None
         wheels, odometry = _joined(self.wheels, following.wheels), _joined(self.odometry, following.odometry)
         return _unless_empty(inertial, wheels, odometry)

@@ -40,9 +40,9 @@ MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 10.0)  # over config.sigma_px: the noise of the best images, and what still is a match
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
 MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
-# Standard deviations of a robot's differences, and root mean squares of the recent ones, if that is more. What moves
-# before the camera may have more points, and older ones, than the store; the camera goes on as before.
-USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
+# Standard deviations of a robot's differences, or of the recent ones if that is more. What moves before the camera may
+# have more points, and older ones, than the store; the camera goes on as before.
+USUAL_DIFFERENCES = (0.002, 1.0), (0.002, 1.5)
 UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
@@ -52,9 +52,8 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 NEARER, WRONG_SIGMAS = 1.25, 2.0
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
-NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
-MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
-KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
+NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a degree of freedom of a pose may rest
+KNOWN_M = 0.005  # standard deviation of a position by the others with which such a point is left out if it is new
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
 MIN_DEPTH_SIGMA = 1e-3  # relative
@@ -327,7 +326,7 @@ class FramePoseSolver:
         if not near.any():
             return pose
         alone = np.zeros(len(tracks), bool)
-        alone[near] = self.influence(tracks.keep(near), pose)[0] > MOST_FREEDOMS
+        alone[near] = self.influence(tracks.keep(near), pose)[0] > 1.0
         if not alone.any() or np.count_nonzero(agree & ~alone) < MIN_GROUP:
             return pose
         by_others = self._optimise(tracks, expected.to(pose.pose), agree & ~alone)
@@ -374,7 +373,7 @@ class FramePoseSolver:
     def _likelihood(self, pose: F64, expected: ExpectedMotion) -> float:
         """Of a pose by the recent accelerations and those of a robot, 1 for the predicted one, UNLIKELY at least."""
         off = np.array(se3.extent(se3.inverse(expected.pose) @ pose))
-        sigmas = off / self._usual_sigmas(expected, USUAL_SIGMAS)
+        sigmas = off / self._usual_sigmas(expected, 2.0)
         return max(math.exp(-0.5 * float(np.square(sigmas).sum())), UNLIKELY)
 
     def _usual_sigmas(self, expected: ExpectedMotion, factor: float) -> F64:

@@ -23,7 +23,8 @@ from stereo_sfm.types import (
 )
 
 SHORT_S = 0.2  # over which the IMU alone is as good as with the wheels
-INERTIAL_S, WHEEL_S = 10.0, 30.0  # longest time without images, by the IMU alone and with wheels
+# Longest time without images, by the IMU alone, whose positions drift with the square of it, and with wheels.
+INERTIAL_S, WHEEL_S = 10.0, 30.0
 BRIDGED_M = 0.5  # largest standard deviation of a position without images
 
 
