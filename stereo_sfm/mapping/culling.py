@@ -30,22 +30,16 @@ def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfi
     rows = rows[points.alive[rows]]
     lost = points.last_seen[rows] < newest
     few = lost & (points.obs_count[rows] < 2)
-    error, parallax = _quality(map_, rig, rows)
+    table, pose, judged = map_.observations, map_.keyframes.map_T_kf, np.empty((len(rows), 2))
+    map_kernels.judge_points(
+        rows, points.head, table.following, table.kf, table.uv_left, table.uv_right, table.sigma,
+        pose[:, :3, :3], pose[:, :3, 3], points.xyz, rig.left.model_id, rig.left.params, rig.baseline, judged,
+    )  # fmt: skip
+    error, parallax = judged.T
     bad = (error > config.max_error_sigmas) & (points.obs_count[rows] >= 2)
     narrow = lost & (parallax < np.deg2rad(config.min_parallax_deg))
     unseen = points.obs_count[rows] == 0
     return rows[few | bad | narrow | unseen]
-
-
-def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
-    """(N,) root mean squared error of the left images in sigmas, and (N,) largest angle between a ray and the first."""
-    table, points, pose = map_.observations, map_.points, map_.keyframes.map_T_kf
-    out = np.empty((len(rows), 2))
-    map_kernels.judge_points(
-        rows, points.head, table.following, table.kf, table.uv_left, table.uv_right, table.sigma,
-        pose[:, :3, :3], pose[:, :3, 3], points.xyz, rig.left.model_id, rig.left.params, rig.baseline, out,
-    )  # fmt: skip
-    return out[:, 0], out[:, 1]
 
 
 def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, config: MapperConfig) -> int:

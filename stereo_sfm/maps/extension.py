@@ -59,17 +59,13 @@ class Extension(Mapper):
                 self.found = True
                 self._misplaced = not np.array_equal(keyframe.rig_terms, self._terms)
                 update = self._with_everything(update)
-        if self._saved_T_session is None:
-            return update
-        return self._in_saved_map(update, self._saved_T_session)
+        return self._in_saved_map(update)
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """As the mapper's."""
         update = super().finish(loops)
         self._follow_found()
-        if update is None or self._saved_T_session is None:
-            return update
-        return self._in_saved_map(update, self._saved_T_session)
+        return None if update is None else self._in_saved_map(update)
 
     def place(self) -> LoopResult | None:
         """The relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.
@@ -111,8 +107,10 @@ class Extension(Mapper):
             points_map=self.map.points.xyz[points],
         )
 
-    @staticmethod
-    def _in_saved_map(update: MapUpdate, saved_T_session: F64) -> MapUpdate:
+    def _in_saved_map(self, update: MapUpdate) -> MapUpdate:
+        saved_T_session = self._saved_T_session
+        if saved_T_session is None:
+            return update
         return dataclasses.replace(
             update,
             map_T_kf=saved_T_session @ update.map_T_kf,

@@ -196,16 +196,13 @@ class WheelMotion:
     def _raw(self, begin_ns: int, end_ns: int) -> F64 | None:
         """(4, 4) motion by the uncorrected wheels; the last one is asked for several times a frame."""
         if self._raw_of[:2] != (begin_ns, end_ns):
-            self._raw_of = begin_ns, end_ns, self._integrated(begin_ns, end_ns)
+            edges, motion = self._series.edges(begin_ns, end_ns), None
+            if edges is not None:
+                values = self._series.means(edges)
+                found = integrate_twists(np.diff(edges) * 1e-9, values[:, 3:], values[:, :3], 0.0, 0.0)
+                motion = se3.from_rotation_translation(found.rotation, found.position)
+            self._raw_of = begin_ns, end_ns, motion
         return self._raw_of[2]
-
-    def _integrated(self, begin_ns: int, end_ns: int) -> F64 | None:
-        edges = self._series.edges(begin_ns, end_ns)
-        if edges is None:
-            return None
-        values = self._series.means(edges)
-        motion = integrate_twists(np.diff(edges) * 1e-9, values[:, 3:], values[:, :3], 0.0, 0.0)
-        return se3.from_rotation_translation(motion.rotation, motion.position)
 
     def _in_camera(self, motion: F64) -> F64:
         """(6,) tangent of a motion of the wheels (4, 4) as one of the camera."""
