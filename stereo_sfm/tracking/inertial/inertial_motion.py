@@ -16,8 +16,8 @@ from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.rotation_filter import RotationFilter
-from stereo_sfm.tracking.inertial.series import SampleBuffer
-from stereo_sfm.types import F64, I64, ImuSamples, InertialLink
+from stereo_sfm.tracking.inertial.series import Intervals, SampleBuffer
+from stereo_sfm.types import F64, ImuSamples, InertialLink
 
 NODE_NS = 200_000_000  # between the poses of the filter
 MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
@@ -28,14 +28,6 @@ MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
 STILL = np.array([0.005, 0.05])  # rad/s, m/s^2: spread of a sensor at rest ...
 STILL_NOISE = 3.0  # ... and its own noise so many times
 STILL_TURN = 0.03  # rad/s that the known bias may be off
-
-
-@dataclass(frozen=True, eq=False)
-class Turning:
-    """Angular velocity in the IMU's axes between successive times."""
-
-    edges_ns: I64  # (N + 1,)
-    rates: F64  # (N, 3) rad/s, without bias
 
 
 class InertialMotion:
@@ -214,10 +206,10 @@ class InertialMotion:
         turned = float(np.abs(found.gyro.mean(axis=0) - self._gyro_bias).max())
         return bool(spreads[0] < limits[0] and spreads[1] < limits[1] and turned < STILL_TURN)
 
-    def turning(self, begin_ns: int, end_ns: int) -> Turning | None:
-        """The gyroscope between two times; None where samples are missing."""
+    def turning(self, begin_ns: int, end_ns: int) -> Intervals | None:
+        """The gyroscope between two times, without its bias; None where samples are missing."""
         found = self._buffer.between(begin_ns, end_ns) if self.use >= SensorUse.ROTATION else None
-        return None if found is None else Turning(found.edges_ns, found.gyro - self._gyro_bias)
+        return None if found is None else replace(found, gyro=found.gyro - self._gyro_bias)
 
     def link(self, begin_ns: int, stamp_ns: int) -> InertialLink | None:
         """From the stamp of the keyframe before to that of a keyframe; None where the IMU does not count.

@@ -11,9 +11,8 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.twist_integration import TwistMotion, integrate_twists
 from stereo_sfm.tracking.inertial.agreement import SensorUse
 from stereo_sfm.tracking.inertial.dead_reckoning import WheelStep
-from stereo_sfm.tracking.inertial.inertial_motion import Turning
 from stereo_sfm.tracking.inertial.rest import STILL_NS
-from stereo_sfm.tracking.inertial.series import Series
+from stereo_sfm.tracking.inertial.series import Intervals, Series
 from stereo_sfm.tracking.inertial.wheel_window import WheelCorrection, WheelWindow
 from stereo_sfm.types import F64, MotionLink, WheelSamples
 
@@ -135,16 +134,16 @@ class WheelMotion:
         """(4, 4) covariance of what is not known of the logarithmic scale and the direction (3,)."""
         return self._correction.covariance
 
-    def step(self, gyro: Turning, left_R_imu: F64) -> WheelStep | None:
+    def step(self, turning: Intervals, left_R_imu: F64) -> WheelStep | None:
         """The way over some time, turned as the gyroscope says; None where samples are missing or wrong.
 
         Where the wheels turn otherwise than the gyroscope they slip, and their way is in doubt.
         """
-        edges, c = gyro.edges_ns, self._correction
+        edges, c = turning.edges_ns, self._correction
         if not self._window.agreed or self._series.edges(int(edges[0]), int(edges[-1])) is None:
             return None
-        seconds, values = np.diff(edges) * 1e-9, self._series.means(edges)
-        rates = gyro.rates @ (self._wheel.left_T_wheel[:3, :3].T @ left_R_imu).T
+        seconds, values = turning.seconds, self._series.means(edges)
+        rates = turning.gyro @ (self._wheel.left_T_wheel[:3, :3].T @ left_R_imu).T
         motion = integrate_twists(seconds, rates, values[:, :3] @ c.matrix.T, 0.0, c.noise)
         by_wheels, turned = float(values[:, 5] @ seconds), float(rates[:, 2] @ seconds)
         doubt = self._window.doubt(motion.seconds, by_wheels, turned)
