@@ -101,10 +101,7 @@ class Map:
 
     def count_by_keyframe(self, points: I64) -> I64:
         """(K,) number of the points that each keyframe observes."""
-        counts, table = np.zeros(len(self.keyframes), np.int64), self.observations
-        points = np.ascontiguousarray(points, np.int64)
-        map_kernels.count_by_keyframe(points, self.points.head, table.following, table.kf, counts)
-        return counts
+        return np.bincount(self.observations.kf[self.sightings(points)[0]], minlength=len(self.keyframes))
 
     def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
         """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, then oldest first."""

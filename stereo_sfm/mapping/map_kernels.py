@@ -30,16 +30,6 @@ def list_observations(points, head, following, out):
 
 
 @njit
-def count_by_keyframe(points, head, following, obs_kf, counts):
-    """Adds to counts (K,) how many of these points every keyframe sees."""
-    for i in range(points.shape[0]):
-        o = head[points[i]]
-        while o >= 0:
-            counts[obs_kf[o]] += 1
-            o = following[o]
-
-
-@njit
 def follow(rows, fused_into):
     """The living row that each row was fused into, in place; -1 stays."""
     for i in range(rows.shape[0]):
