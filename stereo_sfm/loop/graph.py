@@ -23,7 +23,6 @@ REMEMBERED = 4096  # results of each kind since the last loop: a few megabytes
 NEWEST = 128  # keyframes, and twice as many loops, that stay, candidates or not; of the loops between two submaps half
 FEWEST = 8 * NEWEST  # keyframes, at which some are forgotten for the first time
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there: a second has fewer
-HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -264,7 +263,7 @@ def _shortest_path(ends: I64, metres: F64, count: int, start: int, goal: int) ->
     for k in np.argsort(metres, kind="stable").tolist():
         shortest.setdefault((int(ends[k].min()), int(ends[k].max())), k)
     pairs = sorted(shortest)
-    lengths = metres[[shortest[pair] for pair in pairs]] + HOP_METRES
+    lengths = metres[[shortest[pair] for pair in pairs]] + 1e-6  # of equally long paths the one with fewer edges counts
     graph = scipy.sparse.coo_array((lengths, np.array(pairs).reshape(-1, 2).T), shape=(count, count)).tocsr()
     distance, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):

@@ -29,7 +29,6 @@ from stereo_sfm.types import F64, I64, Bool
 
 LONGEST_STEP = 32.0  # steps of Gauss-Newton that `BundleConfig.extend` tries at once: five doublings, then a new system
 LEAST_SQUARES = 100.0  # squared scale of Cauchy's loss over twice the variance: the mean weight is one within a percent
-TO_SIGMA = 1.4826  # from the median of absolute values, of normally distributed ones: 1 / Phi^-1(3/4)
 MIN_RESIDUAL = 0.05  # sigmas, lower bound of a median residual: exact data have none, and a scale of zero
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
@@ -365,7 +364,7 @@ def _disparity_weights(total: F64, information: F64, sigmas: float) -> F64:
         return weight
     mean = total[seen] / information[seen]
     mean = np.abs(mean - median(mean)) * np.sqrt(information[seen])
-    limit = sigmas * max(TO_SIGMA * median(mean), MIN_RESIDUAL)
+    limit = sigmas * max(1.4826 * median(mean), MIN_RESIDUAL)  # 1 / Phi^-1(3/4)
     weight[seen] = (limit / np.maximum(mean, limit)) ** 4
     return weight
 

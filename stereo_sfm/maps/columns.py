@@ -10,7 +10,6 @@ import numpy as np
 from stereo_sfm.mapping.snapshot import Column, MapSnapshot
 
 MAX_ID = 1 << 40  # ids count up from 0, a thousand a second for 30 years
-ROTATION_TOLERANCE = 1e-6  # deviation of a rotation from orthonormal: a float32 that somebody wrote has less
 
 _HINTS = get_type_hints(MapSnapshot, include_extras=True)
 COLUMNS: dict[str, Column] = {name: hint.__metadata__[0] for name, hint in _HINTS.items()}
@@ -36,6 +35,6 @@ def check_columns(arrays: Mapping[str, Any]) -> None:
                 raise ValueError(f"{name} has numbers from {array.min()} to {array.max()}")
             if column.ascending and (np.diff(array) <= 0).any():
                 raise ValueError(f"{name} is not in order")
-    rotations = arrays["map_T_kf"][:, :3, :3]
-    if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=ROTATION_TOLERANCE):
+    rotations = arrays["map_T_kf"][:, :3, :3]  # a float32 that somebody wrote deviates less from orthonormal
+    if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-6):
         raise ValueError("map_T_kf is not rigid")

@@ -26,8 +26,6 @@ from stereo_sfm.tracking.flow.map_points import rows_of
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.types import F64, I64, U8, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
 
-_RECOVER_PX = 4.0  # how near a keyframe's point must reproject to be taken for the same point
-
 
 class FeatureTracker(DescriptorTracker):
     """Motions from frame to frame."""
@@ -123,7 +121,7 @@ class FeatureTracker(DescriptorTracker):
         return motion, self._ids.give_new(view)
 
     def _recover(self, keyframe: FeatureView, view: FeatureView, now_T_kf: F64) -> FeatureView:
-        """Ids for points of the last keyframe that were missed in between: descriptor and position agree.
+        """Ids for points of the last keyframe that were missed in between: descriptor and position, to 4 px, agree.
 
         Args:
             now_T_kf: (4, 4) by the motion just estimated.
@@ -135,7 +133,7 @@ class FeatureTracker(DescriptorTracker):
         if len(rows) == 0:
             return view
         errors = bearing_errors(now_T_kf, keyframe.points[rows[:, 0]], view.bearings[rows[:, 1]])
-        return self._ids.inherit(view, keyframe, rows[errors < _RECOVER_PX * self._pixel])
+        return self._ids.inherit(view, keyframe, rows[errors < 4.0 * self._pixel])
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
         """No motion: continue with the last velocity; after some time without start a new submap there."""

@@ -14,7 +14,6 @@ from stereo_sfm.types import F64, I64, U8, Bool
 
 # Cosine of 70 degrees: bearings further from the axis are not put on an image plane, which stretches nine times there.
 PLANE_LIMIT = np.cos(np.radians(70.0))
-_MIN_FOR_RANSAC = 8  # matches: five determine an essential matrix, three say whether it is right
 
 
 def match_features(first: Features, second: Features, norm: int, ratio: float) -> I64:
@@ -42,7 +41,7 @@ def epipolar_inliers(bearings0: F64, bearings1: F64, threshold: float, rng: np.r
     than eight matches, or no consensus, nothing is an inlier.
     """
     count = len(bearings0)
-    if count < _MIN_FOR_RANSAC:
+    if count < 8:  # five determine an essential matrix, three say whether it is right
         return np.zeros(count, bool)
     if min(bearings0[:, 2].min(), bearings1[:, 2].min()) < PLANE_LIMIT:
         try:

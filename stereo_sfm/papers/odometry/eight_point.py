@@ -15,8 +15,6 @@ from stereo_sfm.geometry.essential import RelativePose, relative_pose
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.papers.motion_estimator import EstimatorEntry, FramePair, Motion
 
-_MIN_SCALED = 5  # points with a depth: the median of their scales withstands two wrong ones
-
 
 def scale_from_points(rotation: np.ndarray, direction: np.ndarray, pair: FramePair, inliers: np.ndarray) -> float:
     """Metres along `direction`, so that R p_last + s d lies on the current ray: weighted median over inliers.
@@ -27,7 +25,7 @@ def scale_from_points(rotation: np.ndarray, direction: np.ndarray, pair: FramePa
         Degenerate: "no_scale" with fewer than five points of known depth.
     """
     rows = inliers & np.isfinite(pair.points_last[:, 2])
-    if rows.sum() < _MIN_SCALED:
+    if rows.sum() < 5:  # whose median withstands two wrong ones
         raise Degenerate("no_scale", f"{int(rows.sum())} matches have depth")
     moved = pair.points_last[rows] @ rotation.T
     ray = pair.bearings_now[rows]

@@ -56,7 +56,6 @@ NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a degree 
 KNOWN_M = 0.005  # standard deviation of a position by the others with which such a point is left out if it is new
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
-MIN_DEPTH_SIGMA = 1e-3  # relative
 
 
 @dataclass(frozen=True)
@@ -416,11 +415,9 @@ class FramePoseSolver:
 
     def refine_depth(self, tracks: Tracks, solution: PoseSolution) -> None:
         """Update the distances of inliers whose position is not from the map."""
-        inlier = solution.inlier & ~tracks.mapped
-        pose_solver.refine_depth(
-            solution.pose, solution.velocity, self._seen(tracks), inlier, self.cameras, self._config.depth_sigma_px,
-            MIN_DEPTH_SIGMA,
-        )  # fmt: skip
+        inlier, sigma_px = solution.inlier & ~tracks.mapped, self._config.depth_sigma_px
+        pose, velocity = solution.pose, solution.velocity
+        pose_solver.refine_depth(pose, velocity, self._seen(tracks), inlier, self.cameras, sigma_px, 1e-3)
 
     def _seen(self, tracks: Tracks) -> SeenPoints:
         """The tracks as the solver takes them."""

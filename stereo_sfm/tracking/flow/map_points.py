@@ -8,8 +8,6 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, I64, Bool, MapUpdate
 
-NEAREST_M = 1e-6  # metres, from the camera: no point is in its centre
-
 
 def take_update(tracks: Tracks, update: MapUpdate, resumed_T_odom: F64) -> Tracks:
     """The tracks with fused points under one id, without culled ones, at their positions in the map.
@@ -52,7 +50,7 @@ def rows_of(ids: I64, wanted: I64) -> tuple[Bool, I64]:
 def _place(tracks: Tracks, rows: Bool, points: F64) -> None:
     """Move tracks to points (M, 3) of the odometry frame, along new rays from their origins."""
     ray = points - tracks.origin[rows]
-    distance = np.maximum(np.linalg.norm(ray, axis=1), NEAREST_M)
+    distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-6)  # no point is in the camera's centre
     tracks.direction[rows] = ray / distance[:, None]
     tracks.rho[rows] = 1.0 / distance
     tracks.mapped[rows] = True
