@@ -95,9 +95,8 @@ class SelfCalibration:
         half_width = 0.5 * rig.left.width
         turn, roll = 1 / rig.left.fx, 2 / half_width
         decentering = roll * rig.left.fx / half_width
-        of_pixel = np.array([turn, turn, roll, np.inf, np.inf, roll, decentering, decentering])
-        self._of_pixel = of_pixel
-        self._expected = Scatter(np.diag(np.minimum(WINDOW_PX * of_pixel, DIRECTION) ** 2))
+        self._of_pixel = np.array([turn, turn, roll, np.inf, np.inf, roll, decentering, decentering])
+        self._expected = Scatter(np.diag(np.minimum(WINDOW_PX * self._of_pixel, DIRECTION) ** 2))
         self._taken_back = np.zeros(RIG_TERMS, bool)
         self._sigma = np.zeros(RIG_TERMS)  # of the corrections, those of the basis
 

@@ -90,8 +90,7 @@ class Relocalizer:
         self.map, self._own, self.camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
         self._rig = widest([rig, *dict.fromkeys(self._own)])  # whose pixels are compared
         self._keyframes = snapshot.keyframes()
-        self._described = np.flatnonzero([k.described for k in self._keyframes])
-        self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
+        self._described = np.array([k.described for k in self._keyframes], bool)
         self._near_share = config.min_inlier_share
         self.config = of_a_part(config, config.relocalize_inliers // 3)  # competing places must be known
         self._side_inliers = config.side_inliers
@@ -259,7 +258,7 @@ class Relocalizer:
     def _gather(self, row: int, sideways: bool) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
         shared = (self._seen[[row]] @ self._sees).toarray()[0]  # points that each keyframe shares with this one
-        shared[self._undescribed] = 0
+        shared[~self._described] = 0
         shared[row] = shared.max() + 1
         order = np.argsort(-shared, kind="stable")[: 1 + CLOUD_KEYFRAMES]
         order = order[shared[order] > 0]
@@ -280,7 +279,7 @@ class Relocalizer:
 
     def _nearest(self, guess: F64, count: int) -> I64:
         """Rows of the nearest keyframes, nearest first."""
-        rows = self._described if len(self._described) else np.arange(len(self._keyframes))
+        rows = np.flatnonzero(self._described if self._described.any() else ~self._described)
         metres, radians = se3.extent(se3.inverse(self.map.map_T_kf[rows]) @ guess)
         return rows[np.argsort(metres + radians, kind="stable")[:count]]
 

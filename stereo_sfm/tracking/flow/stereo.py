@@ -69,7 +69,7 @@ class StereoMatcher:
         """Triangulate matched pixels (N, 2), NaN where unmatched, with the present rig."""
         seen = np.asarray(np.isfinite(uv_right).all(1))
         uv, uv_right = np.ascontiguousarray(uv), np.ascontiguousarray(uv_right)
-        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, -BEHIND_SIGMAS, gated=False)
+        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, gated=False)
 
     def prepare(self, image: StereoImage) -> klt.Pyramid | F32:
         """The second camera's input of `follow` and `match`: a pyramid, or the depth image."""
@@ -127,7 +127,7 @@ class StereoMatcher:
         else:
             uv_right, sigma_px = points_from_depth(self._rig, right, uv)[1], self._usual_sigma(uv)
             good = np.isfinite(uv_right[:, 0])
-        return self._triangulated(uv, uv_right, sigma_px, good, -BEHIND_SIGMAS)
+        return self._triangulated(uv, uv_right, sigma_px, good)
 
     @staticmethod
     def _gives_way(failed: F64, needed: int) -> float:
@@ -143,7 +143,7 @@ class StereoMatcher:
             return self.match(left, right, uv)
         uv_right = self._moved(left, right, uv, self._search(left, right, uv), SEARCH_LEVEL, SEARCH_LEVEL)
         good = np.isfinite(uv_right[:, 0])
-        return self._triangulated(uv, uv_right, self._usual_sigma(uv), good, 0.0, learns=False)
+        return self._triangulated(uv, uv_right, self._usual_sigma(uv), good, coarse=True)
 
     def _search(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64) -> F64:
         """Right pixels (N, 2), accurate to a pixel of the search level, NaN without a match."""
@@ -157,23 +157,17 @@ class StereoMatcher:
         return np.full(len(uv), math.sqrt(2) * self._config.sigma_px)
 
     def _triangulated(
-        self,
-        uv: F64,
-        uv_right: F64,
-        sigma_px: F64,
-        good: Bool,
-        min_rho_sigmas: float,
-        gated: bool = True,
-        learns: bool = True,
+        self, uv: F64, uv_right: F64, sigma_px: F64, good: Bool, gated: bool = True, coarse: bool = False
     ) -> StereoMatch:
-        """`min_rho_sigmas`: smallest inverse distance in its standard deviations; noise may make it negative. `gated`:
-        whether the matches must be near their epipolar curves, about which the gate `learns` from them.
+        """`gated`: whether the matches must be near their epipolar curves, about which the gate learns from them unless
+        they are `coarse`. Noise may make the inverse distances of others negative.
         """
         bearing, rho, variance, offset = triangulate(uv, uv_right, self._cameras, sigma_px)
+        least = 0.0 if coarse else -BEHIND_SIGMAS
         with np.errstate(invalid="ignore"):
-            good = good & (rho > min_rho_sigmas * np.sqrt(variance)) & (rho < 1.0 / (0.5 * self._min_depth))
+            good = good & (rho > least * np.sqrt(variance)) & (rho < 1.0 / (0.5 * self._min_depth))
         if gated:
-            good = self._gate.passed(self._rig, uv, uv_right, good, learns)
+            good = self._gate.passed(self._rig, uv, uv_right, good, not coarse)
         return StereoMatch(uv, uv_right, bearing, rho, variance, offset, good)
 
     def _moved(
