@@ -243,7 +243,9 @@ def _cube(task: Any) -> None:
     path = folder / _cube_name(index)
     key = hashlib.sha256("".join([VERSION, f"{voxel!r}", *(k.place_key() for k in kept)]).encode()).hexdigest()
     if _read(path, key) is None:
-        cube = fuse(index, [Seen(_cached_depth(k.path, k.key), k.floor_T_cam, k.session) for k in kept], voxel)
+        newest_first = sorted(kept, key=lambda k: -k.session)
+        images = (Seen(_cached_depth(k.path, k.key), k.floor_T_cam, k.session) for k in newest_first)
+        cube = fuse(index, images, voxel)
         surface = extract(cube)
         own = np.s_[1 : SIDE + 1, 1 : SIDE + 1, 1 : SIDE + 1]
         seen = cube.views[own] >= LEAST_VIEWS

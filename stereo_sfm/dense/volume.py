@@ -12,9 +12,10 @@ several processes, one at a time in memory, and again only where a keyframe move
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 
 import numpy as np
 
@@ -77,17 +78,16 @@ def contributes(seen_from: F64, reach: F64, index: tuple[int, int, int], voxel: 
     return np.linalg.norm(centre - seen_from, axis=1) <= reach + radius
 
 
-def fuse(index: tuple[int, int, int], images: Sequence[Seen], voxel: float) -> Cube:
-    """A cube from depth images, in the order given; sessions from the newest to the oldest."""
+def fuse(index: tuple[int, int, int], images: Iterable[Seen], voxel: float) -> Cube:
+    """A cube from depth images, one at a time in memory; those of the newest session come first."""
     n = SIDE + 2 * APRON
     corner = (np.array(index) * SIDE - APRON) * voxel
     total = [np.zeros((n, n, n), np.float32) for _ in range(4)]
     sessions = np.zeros((n, n, n), np.uint8)
-    for session in sorted({s.session for s in images}, reverse=True):
+    for _, visit in groupby(images, lambda seen: seen.session):
         own = [np.zeros((n, n, n), np.float32) for _ in range(4)]
-        for seen in images:
-            if seen.session == session:
-                _add(own, seen, corner, voxel)
+        for seen in visit:
+            _add(own, seen, corner, voxel)
         counts = (own[1] > 0) & (sessions < SESSIONS)
         sessions[counts] += 1
         for whole, part in zip(total, own, strict=True):

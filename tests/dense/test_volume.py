@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from weakref import ref
 
 import numpy as np
 import pytest
@@ -96,10 +98,10 @@ def test_a_person_who_was_seen_twice_is_gone_when_others_see_through() -> None:
 
 def test_three_later_sessions_take_away_what_they_contradict() -> None:
     shelf = [wall(1.0, session=0, sigma=0.001)] * 20  # far more weight than the later ones
-    later = [wall(2.0, session=k) for k in (1, 1, 2, 2, 3, 3)]
-    z = mesh([*shelf, *later])[0][:, 2] * VOXEL
+    later = [wall(2.0, session=k) for k in (3, 3, 2, 2, 1, 1)]
+    z = mesh([*later, *shelf])[0][:, 2] * VOXEL
     assert not ((z > 0.9) & (z < 1.1)).any()
-    z = mesh([*shelf, *later[:4]])[0][:, 2] * VOXEL
+    z = mesh([*later[2:], *shelf])[0][:, 2] * VOXEL
     assert ((z > 0.9) & (z < 1.1)).any()
 
 
@@ -119,6 +121,22 @@ def test_a_voxel_gets_the_distance_of_the_pixel_that_sees_it(camera: Camera) -> 
     assert len(off) > 30000
     assert off.max() < 1.1e-3  # the next pixel, where a tenth of one decides
     assert (off > 1e-5).mean() < 0.03
+
+
+def test_a_place_seen_again_and_again_needs_no_more_memory() -> None:
+    alive: list[int] = []
+    made: list[ref[Seen]] = []
+
+    def images() -> Iterator[Seen]:
+        for k in range(8):
+            made.append(ref(one := wall(1.0, session=-(k // 4))))
+            yield one
+            del one
+            alive.append(sum(r() is not None for r in made))
+
+    fuse((0, 0, 0), images(), VOXEL)
+    assert len(alive) == 8
+    assert max(alive) <= 2
 
 
 def test_the_same_bits_again() -> None:
