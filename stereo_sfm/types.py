@@ -298,6 +298,7 @@ class Keyframe(Message):
     doubt: F64 = field(default_factory=lambda: np.zeros(2))  # (2,) m^2, rad^2: see `Keyframes.count_frame`
     right_turn: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) rad, of the right camera besides `rig_terms`
     right_turn_covariance: F64 = field(default_factory=lambda: np.zeros((3, 3)), metadata=shape(3, 3))  # of it
+    readout_s: float = 0.0  # of the rows of its image, with which it was tracked
     samples: SensorSamples | None = None  # where the sensors are calibrated
 
     @property

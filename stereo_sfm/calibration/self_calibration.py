@@ -81,6 +81,7 @@ class SelfCalibration:
     def __init__(self, rig: Rig, applies: bool = True) -> None:
         """`rig`: the calibrated rig, two cameras. `applies`: revisions change the rig of the run."""
         self._rig, self.applies = rig, applies
+        self._rolling = rig.readout_s != 0
         self.terms: F64 = np.zeros(RIG_TERMS)  # current corrections
         self._corrected = np.zeros(RIG_TERMS, bool)
         self._keyframes: list[SeenPoints] = []
@@ -103,6 +104,7 @@ class SelfCalibration:
     def add(self, keyframe: Keyframe) -> Revision | None:
         """Add a keyframe; returns a revision when one becomes significant."""
         seen, self._stamp_ns = SeenPoints.of(keyframe), keyframe.stamp_ns
+        self._rolling |= keyframe.readout_s != 0
         turned = self._sudden_turn(keyframe)
         if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
@@ -231,7 +233,7 @@ class SelfCalibration:
         return _Change(value, choice.sigma, covariance, choice.selected) if value.any() else None
 
     def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
-        return choose(whole, parts, self._rig.readout_s != 0, sigmas, self._corrected)
+        return choose(whole, parts, self._rolling, sigmas, self._corrected)
 
     def _helps(self, halves: Sequence[Sequence[RigWindow]], values: Sequence[F64], basis: F64, back: F64) -> bool:
         """Whether what one half says makes rows and reprojections of the other half's windows better.
@@ -284,7 +286,7 @@ class SelfCalibration:
         """
         basis = np.eye(RIG_TERMS)
         length = np.mean([w.length for w in windows], axis=0)
-        if self._rig.readout_s == 0 and abs(length[1]) > 1e-9:
+        if not self._rolling and abs(length[1]) > 1e-9:
             basis[1, LENSES] = length[LENSES] / length[1]
         return basis
 
@@ -297,7 +299,7 @@ class SelfCalibration:
             return None
         courses = [whole, *(steady(part, windows, self._expected) for part in (windows[::2], windows[1::2]))]
         change, *halves = [c.at([0.0, 1.0]) for c in courses]
-        terms = significant(change, halves, self._rig.readout_s != 0, SIGMAS)
+        terms = significant(change, halves, self._rolling, SIGMAS)
         return _Drift(terms, [c.with_zero(1, ~terms).at([1.0, 0.0]) for c in courses]) if terms.any() else None
 
 

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from stereo_sfm.calib.check import CheckReport, Finding
     from stereo_sfm.calib.mask_search import MaskSearch
     from stereo_sfm.calib.rig import Rig
-    from stereo_sfm.tracking.flow.readout import Readout, ReadoutSearch
+    from stereo_sfm.tracking.flow.readout import Readout
+    from stereo_sfm.tracking.flow.tracker import Tracker
     from stereo_sfm.types import StereoImage
 
-SHUTTER_FRAMES = 200  # looked at for a rolling shutter
 MISTAKE = "images"  # finding of swapped or upside-down images, or an inverted transform
 FIXED_SHARE = 0.003  # of an image, from which on the robot in view is worth a mask
 DEFAULT_SEARCH = 14  # rows
@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.drivers.start_checked import StartCheckedSource
     from stereo_sfm.eval.sensor_motion import SensorMotion
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
+    from stereo_sfm.tracking.flow.tracker import Tracker
 
     _check(options)
     with StartCheckedSource(open_source(options.source, options.rig), correct=True) as source:
@@ -86,17 +87,20 @@ def run(args: argparse.Namespace) -> int:
         total = min(source.frame_count or options.max_frames, options.max_frames)
         gap = 0 if source.live else max(0, total // options.windows - MAX_FRAMES)
         corners = corners_for(total, options.windows)
-        shutter = ReadoutSearch(Config().tracker, rig)
-        masks = MaskSearch()
+        shutter, masks, errors_px = ReadoutSearch(rig), MaskSearch(), list[float]()
         motion = SensorMotion(rig) if rig.imu is not None or rig.wheel is not None else None
-        images = _searched(images, shutter, masks)
+        images = _searched(images, Tracker(Config().tracker, rig, readout=shutter), masks, errors_px)
         images = images if motion is None else motion.watch(images)
         windows = collect(images, rectification, options.windows, gap, corners, options.search or widely)
         readout = shutter.measured()
         mistake = "" if start is None or start.rig else start.text
         report = _checked(lambda: check(rig, rectification, windows, rolling=readout.best_s != 0), mistake)
         others = [] if start is None else [Finding(MISTAKE if mistake else "first images", 2, start.text)]
-        others += [_shutter(rig.shutter, readout), *_robot(masks, rig), *(motion.findings() if motion else [])]
+        others += [
+            _shutter(rig.shutter, readout, errors_px),
+            *_robot(masks, rig),
+            *(motion.findings() if motion else []),
+        ]
         report = replace(report, findings=(*report.findings, *others))
     if options.correct is not None:
         save_rig(report.choice.apply(rig), options.correct)
@@ -109,11 +113,15 @@ def run(args: argparse.Namespace) -> int:
     return 3 if report.verdict == "FAIL" else 0
 
 
-def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: MaskSearch) -> Iterator[StereoImage]:
-    """Pass the images on, tracked once for the rolling shutter, of the first ones, and for the robot in view."""
-    for number, image in enumerate(images):
+def _searched(
+    images: Iterable[StereoImage], tracker: Tracker, masks: MaskSearch, errors_px: list[float]
+) -> Iterator[StereoImage]:
+    """Pass the images on, tracked once: for the rolling shutter, the robot in view, and the points' median errors."""
+    for image in images:
         if image.right is not None:
-            masks.add_tracked(image, *shutter.add(image, number < SHUTTER_FRAMES))
+            masks.add_tracked(image, *tracker.step(image))
+            if tracker.solution is not None:
+                errors_px.append(tracker.solution.residual_px)
         yield image
 
 
@@ -129,18 +137,19 @@ def _checked(check: Callable[[], CheckReport], mistake: str) -> CheckReport:
         raise
 
 
-def _shutter(known: str, readout: Readout) -> Finding:
+def _shutter(known: str, readout: Readout, errors_px: list[float]) -> Finding:
+    from statistics import fmean
+
     from stereo_sfm.calib.check import UNKNOWN, Finding
 
     below = "from below " if readout.measured_s < 0 else ""
-    measured = f"{1e3 * abs(readout.measured_s):.0f} ± {1e3 * readout.sigma_s:.0f} ms"
     if not readout.known:
         return Finding("shutter", 0, f"{known}; {UNKNOWN} unsteadily", judged=False)
     if not readout.differs:
-        error = f"points are off by {readout.error_px:.2f} px (median)"
-        return Finding("shutter", 0, f"{known}; {error}; measured from the motion: {measured}")
+        error = f"points are off by {fmean(errors_px):.2f} px (median)"
+        return Finding("shutter", 0, f"{known}; {error}; measured from the motion: {readout.text}")
     what = "check readout_s in rig.yaml" if readout.calibrated_s else "set readout_s in rig.yaml (see the data sheet)"
-    return Finding("shutter", 1, f"{known}, but the motion shows rows read {below}within {measured}: {what}")
+    return Finding("shutter", 1, f"{known}, but the motion shows rows read {below}within {readout.text}: {what}")
 
 
 def _robot(masks: MaskSearch, rig: Rig) -> list[Finding]:

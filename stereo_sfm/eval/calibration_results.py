@@ -13,6 +13,7 @@ from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.calib.wheel_fit import NAMES as WHEEL_NAMES
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.maps.mounting import Mounting, mounted
+from stereo_sfm.tracking.flow.readout import ROLLING
 from stereo_sfm.tracking.flow.sudden_turn import SUSPECTED
 from stereo_sfm.types import CalibrationUpdate, SensorUpdate
 
@@ -39,8 +40,17 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
 
 def suspicion_stats(record: RunRecord) -> list[dict[str, Any]]:
     """Each sudden rotation of the right camera that was suspected, and each that did not stay."""
+    return _news(record, SUSPECTED)
+
+
+def shutter_stats(record: RunRecord) -> list[dict[str, Any]]:
+    """When the motion showed that the calibration's readout is wrong; empty if it did not."""
+    return _news(record, ROLLING)
+
+
+def _news(record: RunRecord, beginning: str) -> list[dict[str, Any]]:
     first_ns = record.frames.begin_ns
-    news = [(stamp_ns, text) for stamp_ns, text in record.news if text.startswith(SUSPECTED)]
+    news = [(stamp_ns, text) for stamp_ns, text in record.news if text.startswith(beginning)]
     return [{"seconds": (stamp_ns - first_ns) * 1e-9, "text": text} for stamp_ns, text in news]
 
 
@@ -119,7 +129,8 @@ def calibration_lines(stats: dict[str, Any]) -> list[str]:
         f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
         for c in stats["calibration"]
     ]
-    lines = [*begun, *off, *changes, *(f"{s['text']} ({s['seconds']:.1f} s)" for s in stats["suspected"])]
+    news = [f"{new['text']} ({new['seconds']:.1f} s)" for new in (*stats["shutter"], *stats["suspected"])]
+    lines = [*begun, *off, *changes, *news]
     compared = stats["sensor_calibration"]
     if compared is None:
         return lines

@@ -15,6 +15,7 @@ from stereo_sfm.eval.calibration_results import (
     mounting_stats,
     row_error_stats,
     sensor_stats,
+    shutter_stats,
     start_check_stats,
     suspicion_stats,
 )
@@ -95,6 +96,7 @@ def statistics(
         "warnings": list(record.warnings),
         "start_check": start_check_stats(record),
         "calibration": calibration_stats(record),
+        "shutter": shutter_stats(record),
         "suspected": suspicion_stats(record),
         "sensor_calibration": sensor_stats(record),
         "sensors": sensor_use_stats(record),

@@ -35,12 +35,14 @@ def make_tracker(
         tracker = _papers().make_tracker(config, rig, spans, ground_truth)
     else:
         from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+        from stereo_sfm.tracking.flow.readout import ReadoutSearch
         from stereo_sfm.tracking.flow.side_views import SideViews
         from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
         from stereo_sfm.tracking.flow.tracker import Tracker
 
         corners, sides = PlaceCorners.from_config(config, rig), SideViews.from_config(config, rig)
-        tracker = Tracker(config.tracker, rig, spans, corners, places, sides, SuddenTurns.from_config(config, rig))
+        sudden, readout = SuddenTurns.from_config(config, rig), ReadoutSearch.from_config(config, rig)
+        tracker = Tracker(config.tracker, rig, spans, corners, places, sides, sudden, readout)
     return _papers().around(tracker, config, rig) if config.manhattan.enabled else tracker
 
 

@@ -20,6 +20,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import RadTan
 from stereo_sfm.tracking.flow.readout import MIN_PAIRS, Readout, ReadoutSearch
+from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.types import StereoImage
 
 SLOW = pytest.mark.slow  # four seconds each
@@ -33,12 +34,16 @@ def recorded(spec: str, most: int) -> tuple[Rig, list[StereoImage]]:
         return source.rig, list(itertools.islice(source, most))
 
 
-def search(spec: str, calibrated_s: float, change: Callable[[Rig], Rig] = lambda rig: rig, most: int = 200) -> Readout:
+def search(
+    spec: str, calibrated_s: float, change: Callable[[Rig], Rig] = lambda rig: rig, most: int = 200, begin: int = 0
+) -> Readout:
     """As measured with a calibration with readout `calibrated_s` that is wrong by `change`."""
     rig, images = recorded(spec, most)
-    found = ReadoutSearch(TrackerConfig(), change(dataclasses.replace(rig, readout_s=calibrated_s)))
-    for image in images:
-        found.add(image)
+    rig = change(dataclasses.replace(rig, readout_s=calibrated_s))
+    found = ReadoutSearch(rig)
+    tracker = Tracker(TrackerConfig(), rig, readout=found)
+    for image in images[begin:]:
+        tracker.step(image)
     return found.measured()
 
 
@@ -114,6 +119,14 @@ def test_kitti_has_a_global_shutter(yaw_deg: float, data_root: Path) -> None:
 def test_global_shutters_are_recognised(name: str, data_root: Path) -> None:
     found = search(str(data_root / name), 0.0)
     assert found.known and found.best_s == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("begin", [0, 50, 100, 150])
+def test_a_camera_that_hops_has_no_rolling_shutter(begin: int, data_root: Path) -> None:
+    """The right one of Karlsruhe does, at 10 Hz: pairs of images are not independent, and few tell much."""
+    for most in range(24, 60, 3):
+        assert not search(str(data_root / "karlsruhe_part"), 0.0, most=begin + most, begin=begin).differs
 
 
 @pytest.mark.slow

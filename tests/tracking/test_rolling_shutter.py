@@ -15,6 +15,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
 from stereo_sfm.tracking.flow import pose_solver
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+from stereo_sfm.tracking.flow.readout import ReadoutSearch
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracker import Tracker
@@ -155,8 +156,8 @@ def test_equal_stamps_of_the_first_images_tell_no_velocity() -> None:
     assert all(np.isfinite(f.odom_T_cam).all() for f in frames)
 
 
-def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
-    tracker = Tracker(load().tracker, rig)
+def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory, readout: ReadoutSearch | None = None) -> float:
+    tracker = Tracker(load().tracker, rig, readout=readout)
     frames = [f for image in images if (f := tracker.step(image)[0]).state == TrackState.OK]
     assert len(frames) >= len(images) - 1
     poses = np.array([f.odom_T_cam for f in frames])
@@ -178,6 +179,20 @@ def test_a_rendered_sequence_with_a_rolling_shutter(readout: float, seeds: int) 
     print(f"{known} mm, without the times of the rows {unknown} mm")
     assert max(known) < 3.5
     assert np.mean(known) < np.mean(unknown) / 2
+
+
+@pytest.mark.parametrize("readout", [0.025, -0.025])
+def test_a_run_learns_the_readout(readout: float) -> None:
+    spec = f"sim:aisle?camera=pinhole&size=320x200&start=60&frames=100&vibration=4&readout={readout}"
+    with open_source(spec) as source:
+        images, truth, silent = list(source), source.ground_truth, dataclasses.replace(source.rig, readout_s=0.0)
+    assert truth is not None
+    watching, learning = ReadoutSearch(silent), ReadoutSearch(silent, applies=True)
+    unknown, learned = ate_mm(silent, images, truth, watching), ate_mm(silent, images, truth, learning)
+    assert watching.used_s == 0 and watching.measured().differs
+    assert learning.used_s == pytest.approx(readout, abs=0.004)
+    print(f"{learned} mm, without the times of the rows {unknown} mm")
+    assert learned < 0.75 * unknown
 
 
 def test_keyframes_of_a_rendered_sequence_are_those_of_a_global_shutter() -> None:

@@ -130,6 +130,7 @@ class Keyframes:
             **({} if sudden is None else {"right_turn": sudden.turn, "right_turn_covariance": sudden.covariance}),
             odometry=self._moved(odom_T_cam, covariance) if submap_id == self._submap_id else None,
             doubt=self._doubt,
+            readout_s=self._shutter.readout_s,
             **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )
         self._stamp_ns, self._submap_id = image.stamp_ns, submap_id

@@ -34,6 +34,7 @@ from stereo_sfm.tracking.flow.motion_prior import Expectation
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+from stereo_sfm.tracking.flow.readout import ReadoutSearch
 from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery, within
 from stereo_sfm.tracking.flow.rolling_shutter import MIN_INTERVAL_S, RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
@@ -74,14 +75,16 @@ class Tracker:
         places: Places | None = None,
         side_views: SideViews | None = None,
         sudden: SuddenTurns | None = None,
+        readout: ReadoutSearch | None = None,
     ) -> None:
         """Args:
         place_corners: detector of the corners for place recognition; None: keyframes have none.
         places: relocalization after a loss of tracking; None: there is none.
         side_views: views for place recognition in the opposite direction; None: keyframes have none.
         sudden: None: the mapper does not correct the rig.
+        readout: None: the readout is the calibration's.
         """
-        self._config, self._rig = config, rig
+        self._config, self._rig, self._readout = config, rig, readout
         self._rig_terms: F64 = np.zeros(RIG_TERMS)  # current correction of the rig
         self._sudden = sudden
         self._spans = spans or NoSpans()
@@ -169,6 +172,9 @@ class Tracker:
             self._renew_reference(image, images, tracks, solution)
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
+        if self._readout is not None:
+            self._readout.add(image.stamp_ns, self._pose, self._tracks, inlier)
+            self._use_readout(self._readout.used_s)
         keyframe = None
         uncertain = self._part.uncertain(self._follower.reference, solution.covariance, image.stamp_ns)
         if self._recovery.unobstructed or not uncertain:
@@ -178,7 +184,7 @@ class Tracker:
                 self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
         stats |= {} if self._sensors is None else self._sensors.level(self._pose) | self._sensors.use_of_each()
-        news = (watched.news() for watched in (self._sudden, self._sensors) if watched is not None)
+        news = (watched.news() for watched in (self._sudden, self._sensors, self._readout) if watched is not None)
         reason = next(filter(None, news), "")
         return self._frame(image, self._pose, solution.covariance, state, reason, inlier, keyframe, stats), keyframe
 
@@ -256,6 +262,13 @@ class Tracker:
             return None
         self._use_rig()
         return self._track(images, expected)
+
+    def _use_readout(self, readout_s: float) -> None:
+        """The points that contradicted a global shutter may be at rest, and are elsewhere."""
+        first = not self._shutter.active
+        self._shutter.use(readout_s)
+        if first and self._shutter.active:
+            self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
 
     # -- stages ----------------------------------------------------------------------------------------------------
 
@@ -521,6 +534,8 @@ class Tracker:
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
         """Predict the pose; after some time with an open view start a new submap."""
+        if self._readout is not None:
+            self._readout.interrupt()
         bridge = self._bridge(image.stamp_ns)
         expected = self._expect(image.stamp_ns, bridge)
         self._follower.search_widely()
