@@ -107,14 +107,18 @@ def keyframes(rig: Rig) -> list[Keyframe]:
 
 
 def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
-    """What the default tracker does where a prediction fails, it is lost or somebody is near, and with an IMU."""
+    """What the default tracker does where a prediction fails, it is lost or somebody is near, with an IMU, and when it
+    learns that rows are read one after the other."""
     if config.odometry.method != "flow":
         return
     pyramid = build_pyramid(image, config.tracker.pyramid_levels)
     CoarseRotation(rig.left, config.tracker.pyramid_levels).align(pyramid, pyramid, np.eye(3))
     uv, warps, patches = np.zeros((1, 2)), np.tile(np.eye(2), (1, 1, 1, 1)), np.zeros((1, FLAT_SIZE), np.float32)
     find_deformed(pyramid[1], uv, warps, np.zeros(1, np.int64), patches, 1, 1, uv.copy(), warps[0].copy())
-    solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), RollingShutter(rig))
+    shutter = RollingShutter(rig)
+    solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), shutter)
+    shutter.use(0.01)  # that the rig's is wrong may turn out in the run
+    shutter.project(np.eye(4), np.zeros(6), np.ones((1, 3)), uv)
     solution = no_pose(0, "")
     solver.shift_chi2(Tracks(), solution)
     solver.influence(Tracks(), solution)

@@ -21,7 +21,7 @@ from stereo_sfm.tracking.flow import pose_solver
 from tests.calib.test_formats import RIGS
 
 CHILD = """
-import itertools, sys
+import dataclasses, itertools, sys
 from numba.core.dispatcher import Dispatcher
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.source import open_source
@@ -30,7 +30,8 @@ from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.warm_up import warm_up_stage
 
 with open_source(sys.argv[1]) as source:
-    source = MemorySource(source.rig, list(itertools.islice(source, 300)))  # rendered or decoded
+    silent = dataclasses.replace(source.rig, readout_s=0.0)  # the run learns it
+    source = MemorySource(silent, list(itertools.islice(source, 300)))  # rendered or decoded
     for stage in ("tracker", "mapper", "loop"):
         warm_up_stage(stage, Config(), source.rig)
     late, load = [], Dispatcher.compile
@@ -70,6 +71,7 @@ compile_share(Config(), RIGS[sys.argv[1]])
 print(*sorted(set(late)))
 """
 SIMULATED = "sim:people?frames=40&size=320x200&vibration=2"
+ROLLING = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025"
 # A process of some ten seconds each: the lenses of most cameras by default, the others with the slow tests.
 ONE_OF_EACH = [pytest.param(name, marks=() if name in ("fisheye", "radtan") else pytest.mark.slow) for name in RIGS]
 
@@ -98,7 +100,9 @@ def late_kernels(source: str) -> list[str]:
     return child.stdout.split()
 
 
-@pytest.mark.parametrize("source", [str(demo_recording()), f"{SIMULATED}&camera=pinhole", f"{SIMULATED}&imu=t265"])
+@pytest.mark.parametrize(
+    "source", [str(demo_recording()), f"{SIMULATED}&camera=pinhole", f"{SIMULATED}&imu=t265", ROLLING]
+)
 def test_nothing_is_compiled_after_the_warm_up(source: str) -> None:
     assert late_kernels(source) == []
 
