@@ -124,6 +124,7 @@ class ReadoutSearch:
         """`applies`: the measured readout is used as soon as it is better than the calibration's."""
         self._camera, self._calibrated_s, self._applies = rig.left, rig.readout_s, applies
         self.used_s = rig.readout_s
+        self.few_agree = False  # points with the last poses
         self._settled = False
         self._views: deque[_View] = deque(maxlen=4)
         self._total: F64 = np.zeros(2)  # over pairs: displacement * movement, displacement squared, weighted
@@ -186,7 +187,8 @@ class ReadoutSearch:
         velocities = _velocity((first, before, now)), _velocity((before, now, last))
         _, i, j = np.intersect1d(before.point_ids, now.point_ids, return_indices=True)
         agree = before.agrees[i] & now.agrees[j]
-        if np.count_nonzero(agree) >= MIN_POINTS:
+        self.few_agree = np.count_nonzero(agree) < MIN_POINTS
+        if not self.few_agree:
             i, j = i[agree], j[agree]
         if velocities[0] is None or velocities[1] is None:
             return False

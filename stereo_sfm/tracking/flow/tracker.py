@@ -174,7 +174,7 @@ class Tracker:
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         if self._readout is not None:
             self._readout.add(image.stamp_ns, self._pose, self._tracks, inlier)
-            self._use_readout(self._readout.used_s)
+            self._use_readout(self._readout)
         keyframe = None
         uncertain = self._part.uncertain(self._follower.reference, solution.covariance, image.stamp_ns)
         if self._recovery.unobstructed or not uncertain:
@@ -263,12 +263,22 @@ class Tracker:
         self._use_rig()
         return self._track(images, expected)
 
-    def _use_readout(self, readout_s: float) -> None:
-        """The points that contradicted a global shutter may be at rest, and are elsewhere."""
-        first = not self._shutter.active
-        self._shutter.use(readout_s)
-        if first and self._shutter.active:
-            self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
+    def _use_readout(self, readout: ReadoutSearch) -> None:
+        """Use the readout as it is now known; a first one places the points anew.
+
+        Where most of them contradicted a global shutter, what was taken for moving may be at rest.
+        """
+        rolls = self._shutter.active
+        self._shutter.use(readout.used_s)
+        if self._shutter.active == rolls:
+            return
+        moving, misses = self._tracks.moving.copy(), self._tracks.misses.copy()
+        self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
+        if readout.few_agree:
+            self._solver.forget()
+            self._movers.forget()
+        else:
+            self._tracks.moving, self._tracks.misses = moving, misses
 
     # -- stages ----------------------------------------------------------------------------------------------------
 
