@@ -74,6 +74,11 @@ class Readout:
         return self._error_s > KNOWN_S and self._reach(self._error_s) > DEVIATIONS
 
     @property
+    def matters(self) -> bool:
+        """Whether it differs by surely more (two standard errors) than is worth a change."""
+        return self.differs and self._error_s - KNOWN_S > 2 * self.sigma_s
+
+    @property
     def known(self) -> bool:
         """Whether the motion determines the readout."""
         return self.differs or self.sigma_s < KNOWN_S
@@ -153,7 +158,7 @@ class ReadoutSearch:
             return
         found = self.measured()
         self._settled = found.settled
-        if self._applies and found.differs:
+        if self._applies and found.matters:
             most_s = self._seconds / self._count  # all rows are read before those of the next image
             self.used_s = min(max(found.measured_s, -most_s), most_s)
 
@@ -166,13 +171,15 @@ class ReadoutSearch:
         rest = np.array([1.0, -readout_s])
         own, *shared = (float(rest @ products @ rest) for products in self._products)
         spread_s = math.sqrt(own + 2 * max(sum(shared), 0.0)) / float(square)
-        freedom = max(float(square**2 / self._products[0, 1, 1]) - 1, 0.1)  # if all pairs told as much, one less
+        freedom = max(
+            float(square**2 / self._products[0, 1, 1]) - 1, 0.1
+        )  # if all pairs weighed the same, one less than pairs
         return Readout(self._calibrated_s, readout_s, spread_s, freedom)
 
     def news(self) -> str:
         """That the calibration's readout is wrong, once that is certain; "" otherwise."""
         found = self.measured()
-        if self._said or not found.differs:
+        if self._said or not found.matters:
             return ""
         self._said = True
         below = "from below " if found.measured_s < 0 else ""
