@@ -141,9 +141,9 @@ class ReadoutSearch:
 
     @staticmethod
     def from_config(config: Config, rig: Rig) -> ReadoutSearch | None:
-        """That of a run; None where the calibration is not checked."""
+        """That of a run; None where the calibration states a readout, or is not checked."""
         mode = config.self_calibration.mode
-        return None if mode == "off" else ReadoutSearch(rig, mode == "auto")
+        return None if mode == "off" or rig.readout_s != 0 else ReadoutSearch(rig, mode == "auto")
 
     def interrupt(self) -> None:
         """An image has no pose."""
