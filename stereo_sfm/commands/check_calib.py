@@ -92,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         images = _searched(images, Tracker(Config().tracker, rig, readout=shutter), masks, errors_px)
         images = images if motion is None else motion.watch(images)
         windows = collect(images, rectification, options.windows, gap, corners, options.search or widely)
-        readout = shutter.measured()
+        readout = shutter.measured
         mistake = "" if start is None or start.rig else start.text
         report = _checked(lambda: check(rig, rectification, windows, rolling=readout.best_s != 0), mistake)
         others = [] if start is None else [Finding(MISTAKE if mistake else "first images", 2, start.text)]

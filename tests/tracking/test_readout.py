@@ -44,7 +44,7 @@ def search(
     tracker = Tracker(TrackerConfig(), rig, readout=found)
     for image in images[begin:]:
         tracker.step(image)
-    return found.measured()
+    return found.measured
 
 
 def turned(axis: int, degrees: float) -> Callable[[Rig], Rig]:

@@ -189,7 +189,7 @@ def test_a_run_learns_the_readout(readout: float) -> None:
     assert truth is not None
     watching, learning = ReadoutSearch(silent), ReadoutSearch(silent, applies=True)
     unknown, learned = ate_mm(silent, images, truth, watching), ate_mm(silent, images, truth, learning)
-    assert watching.used_s == 0 and watching.measured().differs
+    assert watching.used_s == 0 and watching.measured.differs
     assert learning.used_s == pytest.approx(readout, abs=0.004)
     print(f"{learned} mm, without the times of the rows {unknown} mm")
     assert learned < 0.75 * unknown

@@ -56,6 +56,7 @@ NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a degree 
 KNOWN_M = 0.005  # standard deviation of a position by the others with which such a point is left out if it is new
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
+MIN_DEPTH_SIGMA = 1e-3  # relative
 
 
 @dataclass(frozen=True)
@@ -417,7 +418,7 @@ class FramePoseSolver:
         """Update the distances of inliers whose position is not from the map."""
         inlier, sigma_px = solution.inlier & ~tracks.mapped, self._config.depth_sigma_px
         pose, velocity = solution.pose, solution.velocity
-        pose_solver.refine_depth(pose, velocity, self._seen(tracks), inlier, self.cameras, sigma_px, 1e-3)
+        pose_solver.refine_depth(pose, velocity, self._seen(tracks), inlier, self.cameras, sigma_px, MIN_DEPTH_SIGMA)
 
     def _seen(self, tracks: Tracks) -> SeenPoints:
         """The tracks as the solver takes them."""

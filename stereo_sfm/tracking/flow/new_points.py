@@ -84,11 +84,11 @@ class NewPoints:
         self._next_point_id += n
         return tracks
 
-    def triangulate_again(self, tracks: Tracks, pose: F64, velocity: F64) -> None:
+    def triangulate_again(self, tracks: Tracks, pose: F64, velocity: F64, keep_marks: bool = False) -> None:
         """Place the tracks of the last image, at a pose (4, 4) with a velocity (6,), by the rig as it is known now.
 
-        Those that the second camera does not see keep their positions. None is taken for moving: what contradicted
-        another rig need not contradict this one.
+        Those that the second camera does not see keep their positions. None is taken for moving, unless marks are kept:
+        what contradicted another rig need not contradict this one.
         """
         match = self._stereo.placed(tracks.uv, tracks.uv_right)
         seen = match.good
@@ -97,7 +97,8 @@ class NewPoints:
         tracks.rho[seen] = np.maximum(match.rho[seen], MIN_RHO)
         tracks.variance[seen], tracks.right_offset[seen] = match.variance[seen], match.offset[seen]
         tracks.mapped[seen] = False
-        tracks.moving[:], tracks.misses[:] = False, 0
+        if not keep_marks:
+            tracks.moving[:], tracks.misses[:] = False, 0
 
     def seen(self, images: StereoPyramids) -> F64:
         """(M, 3) metres in the camera, none behind it: corners spread over the image, as many as are tracked."""

@@ -36,11 +36,21 @@ class RollingShutter:
         self._right_T_left = se3.inverse(rig.left_T_right)
         self._mean: F64 | None = None  # (6,) velocity between the last two frames
         self._change = np.full(2, FIRST_CHANGE**2)  # variance of its changes along one axis: linear, angular
-        self.use(rig.readout_s)
+
+    @property
+    def readout_s(self) -> float:
+        """Of the rig as it is now known."""
+        return self._rig.readout_s
+
+    @property
+    def active(self) -> bool:
+        """Whether rows are exposed one after the other."""
+        return self._rig.readout_s != 0
 
     def use(self, readout_s: float) -> None:
         """Use another readout, in seconds."""
-        self.readout_s, self.active = readout_s, readout_s != 0
+        if readout_s != self._rig.readout_s:
+            self._rig = replace(self._rig, readout_s=readout_s)
 
     def learn(self, mean: F64, seconds: float) -> None:
         """Update the steadiness with the mean velocity (6,) since the last frame, `seconds` before."""
@@ -60,7 +70,7 @@ class RollingShutter:
         """(N,) seconds from the stamp to the exposure of the rows of pixels (N, 2); (0,) with a global shutter."""
         if not self.active:
             return np.zeros(0)
-        return (uv[:, 1] / (self._rig.left.height - 1) - 0.5) * self.readout_s
+        return self._rig.row_seconds(uv[:, 1])
 
     def rays(self, odom_T_cam: F64, velocity: F64, uv: F64, bearing: F64) -> tuple[F64, F64]:
         """Origins (N, 3) and directions (N, 3) in the odometry frame of the rays of pixels (N, 2), bearings (N, 3)."""

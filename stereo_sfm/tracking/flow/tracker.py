@@ -272,13 +272,10 @@ class Tracker:
         self._shutter.use(readout.used_s)
         if self._shutter.active == rolls:
             return
-        moving, misses = self._tracks.moving.copy(), self._tracks.misses.copy()
-        self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
+        self._new_points.triangulate_again(self._tracks, self._pose, self._velocity, not readout.few_agree)
         if readout.few_agree:
             self._solver.forget()
             self._movers.forget()
-        else:
-            self._tracks.moving, self._tracks.misses = moving, misses
 
     # -- stages ----------------------------------------------------------------------------------------------------
 
