@@ -42,7 +42,7 @@ SHARING = 3  # pairs before a pair with which it shares some of the four images 
 STEADY = 0.1  # of a new change of velocity in their mean, in which vibration cancels; not removed: KITTI 01 has -30 ms
 MIN_POINTS = 30  # in both images of a pair
 # Standard deviations of a Gaussian, of one in 2,000 by chance, between measured and calibrated readout that differ. In
-# 31 runs of 17 sequences with a global shutter, asked at every image, the largest is 3.3.
+# 33 runs of 17 sequences with a global shutter, asked at every image, the largest is 3.3.
 DEVIATIONS = 3.5
 SMOOTHING = 0.1  # share of the readout: velocities from poses 1/15 s apart, of a robot with vibration
 # Smallest difference, and largest standard error with which a readout of 20 ms, a common one, differs from none.
