@@ -51,7 +51,7 @@ DECIDING = (*PACKAGES, f":!{SIMULATOR}")  # files that decide the results of rea
 RUNNER = Path(__file__).with_name("_real_run.py")
 LONGEST_S = 3600.0  # of a run: then it hangs
 STOPPED = (130, -2, -15)  # exit codes of a run that somebody stopped: it is run again
-STEREO_ONLY = ("self-calibration", "steps", "side views")
+STEREO_ONLY = ("steps", "side views")
 
 
 @dataclass(frozen=True)
