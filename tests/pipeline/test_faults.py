@@ -29,7 +29,7 @@ from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.stage_processes import raise_file_limit
 from stereo_sfm.pipeline.watchdog import SILENT_S, Watchdog
 from stereo_sfm.types import Dropped
-from tests.pipeline.test_pipeline import CONFIG, SlidingWall, inline, same
+from tests.pipeline.test_pipeline import CONFIG, SlidingWall, all_end, inline, same
 
 __all__ = ["inline"]  # a fixture
 
@@ -220,7 +220,7 @@ def test_a_hanging_stage_blocks_neither_the_end_nor_the_log(
     except KeyboardInterrupt:
         assert second_signal
     assert time.monotonic() - begin < END_S
-    assert not any(psutil.pid_exists(pid) for pid in run.pids.values())
+    assert all_end(run.pids)
     assert closed(path)
     with LogReader(path) as reader:
         assert ended_early(reader)
