@@ -62,6 +62,7 @@ RULES = (
     ),
     _rule("confirmed by known points", SOLVER, "if usual and self._confirmed(chosen, known, MIN_GROUP):", "if False:"),
     _rule("implausible motion", SOLVER, "and self._plausible(s.pose, expected)]", "]"),
+    _rule("evidence of its own", SOLVER, "any(s is agreed for s in plausible)", "True"),
     _rule(
         "consistent points",
         SOLVER,

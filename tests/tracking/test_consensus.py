@@ -97,6 +97,26 @@ def test_the_motion_to_another_pose_begins_at_the_same_one() -> None:
     assert motion.velocity == pytest.approx(se3.log(MOVED) / 0.1)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_points_that_agree_with_both_motions_are_no_evidence_of_rest(seed: int) -> None:
+    """A recording begins while the camera drives, six metres a second; of the far points one cannot tell."""
+    rng, driven = np.random.default_rng(seed), se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.005, 0.0]))
+    tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < 130)
+    far = np.arange(130) >= 100
+    depth = np.where(far, rng.uniform(300.0, 600.0, 130), rng.uniform(6.0, 25.0, 130))
+    before = depth[:, None] * np.column_stack([rng.uniform([-0.5, -0.3], [0.5, 0.3], (130, 2)), np.ones(130)])
+    before[far] *= [0.2, 0.2, 1.0]
+    now, distance = se3.transform(se3.inverse(driven), before), np.linalg.norm(before, axis=1)
+    assert RIG.right is not None
+    tracks.direction, tracks.rho, tracks.age = before / distance[:, None], 1 / distance, np.zeros(130, np.int32)
+    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.1, (130, 2))
+    tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.1, (130, 2))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    solution = solver.solve(tracks, ExpectedMotion(np.eye(4), np.zeros(6), 0.1), np.eye(4), before=140)
+    assert float(se3.extent(se3.inverse(driven) @ solution.pose)[0]) < 0.1
+    assert not solution.moving.any() and solution.inlier.mean() > 0.9
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_person_followed_for_as_long_as_the_store_does_not_take_the_pose_along(seed: int) -> None:
     """Who stood before the camera has the older points, and more of them; at the first step the camera goes on."""
