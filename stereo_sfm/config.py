@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -338,15 +339,9 @@ class LoopConfig:
         """Share of inliers required after a loss of tracking, where odometry cannot confirm the loop."""
         return 2.0 * self.min_inlier_share
 
-    @property
-    def gate_m_per_m(self) -> float:
-        """Increase of `gate_m` per metre travelled: drift of scale and heading of a percent."""
-        return self.gate_m / 30.0
-
-    @property
-    def gate_deg_per_m(self) -> float:
-        """Increase of `gate_deg` per metre travelled."""
-        return self.gate_deg / 10.0
+    def gate(self, metres: float = 0.0) -> tuple[float, float]:
+        """Metres and radians by which odometry over so many metres may err: a percent of them, and at first more."""
+        return self.gate_m * (1.0 + metres / 30.0), math.radians(self.gate_deg) * (1.0 + metres / 10.0)
 
 
 @dataclass(frozen=True)

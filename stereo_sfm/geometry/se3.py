@@ -190,6 +190,12 @@ def extent(a_T_b: F64) -> tuple[F64, F64]:
     return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), np.arccos(np.clip((trace - 1) / 2, -1, 1))
 
 
+def within(a: F64, b: F64, metres: float, radians: float) -> bool:
+    """Whether two transforms (4, 4) differ by less than a translation and a rotation."""
+    moved, turned = extent(inverse(a) @ b)
+    return bool(moved < metres and turned < radians)
+
+
 def interpolate(a_T_b0: F64, a_T_b1: F64, fraction: F64 | float) -> F64:
     """Geodesic between two transforms at `fraction` in [0, 1] (may be an array of leading shape)."""
     xi = log(inverse(a_T_b0) @ a_T_b1)

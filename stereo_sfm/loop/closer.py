@@ -38,7 +38,6 @@ from stereo_sfm.loop.verification import (
     rejection,
     verify,
     verify_near,
-    within,
 )
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.correction import DRIFT
@@ -51,8 +50,7 @@ RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another
 TWIN = 0.85  # the corresponding limit of the share of corners of its best keyframe, where several found it
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
-# Largest difference of two keyframes' estimates of one loop: noise of both, and drift between them.
-AGREE_METRES, AGREE_DEGREES = 0.15, 2.0
+SAME_LOOP = 0.15, math.radians(2.0)  # metres, radians between two keyframes' estimates of one: noise, and drift
 DOUBT_SIGMAS = 3.0  # of odometry in doubt that a loop may contradict: noise does in one of 400
 
 
@@ -337,10 +335,8 @@ class LoopCloser:
         kf_id, candidate, votes, share = keyframe.kf_id, of.kf_id, self._config.consistent, verdict.share
         path, anywhere = self._graph.path(candidate, kf_id), False
         if path is not None:
-            doubt_m, doubt_deg = DOUBT_SIGMAS * path.sigmas * [1.0, 180.0 / math.pi]
-            metres = config.gate_m + config.gate_m_per_m * path.metres + doubt_m
-            degrees = config.gate_deg + config.gate_deg_per_m * path.metres + doubt_deg
-            near = within(se3.inverse(path.a_T_b) @ candidate_T_kf, metres, degrees)
+            gate = config.gate(path.metres) + DOUBT_SIGMAS * path.sigmas
+            near = se3.within(path.a_T_b, candidate_T_kf, *gate)
             against = "" if near else "against_odometry"
         else:
             gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
@@ -420,7 +416,7 @@ class LoopCloser:
         if back is None or ahead is None:
             return None
         implied = back.a_T_b @ new.candidate_T_kf @ ahead.a_T_b
-        return within(se3.inverse(earlier.candidate_T_kf) @ implied, AGREE_METRES, AGREE_DEGREES)
+        return se3.within(earlier.candidate_T_kf, implied, *SAME_LOOP)
 
     def _accept(self, keyframe: Keyframe, candidate: Candidate, verdict: Verdict) -> LoopResult:
         candidate_T_kf = se3.inverse(verdict.b_T_a)

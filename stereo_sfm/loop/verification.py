@@ -154,9 +154,3 @@ def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
     left, right, points, sigmas = (c[rows_b] for c in (view.uv_left, view.uv_right, view.points, view.sigmas))
     known_a, seen_a = (cloud.points[rows_a], cloud.sigmas[rows_a]), cloud.seen_by_centre(rows_a)
     return Matches(*known_a, left, right, points, sigmas, *seen_a)
-
-
-def within(error: F64, metres: float, degrees: float) -> bool:
-    """Whether a transform (4, 4) is within limits of translation and rotation."""
-    moved, turned = se3.extent(error)
-    return bool(moved <= metres and np.rad2deg(turned) <= degrees)

@@ -7,7 +7,6 @@ import numpy as np
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calibration.self_calibration import SelfCalibration
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.verification import within
 from stereo_sfm.mapping.level import mean_down
 from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
@@ -114,5 +113,4 @@ class Localizer(AnyMapper):
         return not_found("not_confirmed_yet", place.inliers)
 
     def _within_gate(self, guess: F64, place: Location) -> bool:
-        config = self._relocalizer.config
-        return within(se3.inverse(guess) @ place.map_T_cam, config.gate_m, config.gate_deg)
+        return se3.within(guess, place.map_T_cam, *self._relocalizer.config.gate())

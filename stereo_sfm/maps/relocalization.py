@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,13 +27,13 @@ from stereo_sfm.loop.sideways import (
     of_a_part,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near, within
+from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.tracking.flow.recovery import RIVAL
 from stereo_sfm.types import F64, I64, Keyframe
 
-SAME_PLACE = 0.2, 5.0  # metres, degrees: closer results are the same place: lamps and products repeat at larger steps
+SAME_PLACE = 0.2, math.radians(5.0)  # metres, radians between results: lamps and products repeat at larger steps
 MIN_RANGE_SIGMA_M = 0.003  # metres, of a point of the map however many keyframes saw it: the map bends a little
 PLACES = 16  # that are verified for an image, and for its side views, where no confident one ends the search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
@@ -70,7 +71,7 @@ def not_found(reason: str, inliers: int = 0) -> Location:
 
 def _distinct(a: Location, b: Location) -> bool:
     """Whether they are different places."""
-    return not within(se3.inverse(a.map_T_cam) @ b.map_T_cam, *SAME_PLACE)
+    return not se3.within(a.map_T_cam, b.map_T_cam, *SAME_PLACE)
 
 
 class Relocalizer:

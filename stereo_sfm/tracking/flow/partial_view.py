@@ -10,8 +10,9 @@ import math
 
 import numpy as np
 
+from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.follower import ReferenceImage
-from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, within
+from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL
 from stereo_sfm.types import F64
 
 MORE_RECALL = 0.15  # by which more of the reference points must be found than before
@@ -53,7 +54,7 @@ class PartialView:
         if recall < self._recall + MORE_RECALL:
             return False
         sigma_m = _sigma_m(covariance)
-        contradicted = not within(before, after, CONTRADICTED_SIGMAS * math.hypot(sigma_m, self._sigma_m), math.inf)
+        contradicted = not se3.within(before, after, CONTRADICTED_SIGMAS * math.hypot(sigma_m, self._sigma_m), math.inf)
         return contradicted or sigma_m < self._sigma_m
 
     def end(self, recall: float) -> None:

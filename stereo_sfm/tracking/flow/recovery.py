@@ -108,7 +108,7 @@ class Recovery:
         if not found:
             return None
         best = max(found, key=lambda x: x[2])
-        rivals = [recall for _, s, recall in found if not within(s.pose, best[1].pose, *SAME_PLACE)]
+        rivals = [recall for _, s, recall in found if not se3.within(s.pose, best[1].pose, *SAME_PLACE)]
         return None if any(recall > RIVAL * best[2] for recall in rivals) else best
 
     def _occupied(self, corners: Corners) -> F64:
@@ -122,9 +122,3 @@ def _recall_needed(prediction: Expectation, pose: F64) -> float:
     """The least recall of a pose (4, 4)."""
     off = prediction.sigmas_off(pose)
     return MIN_RECALL * (1.0 + off) + RECALL_PER_METRE * min(prediction.sigma_m, MAX_SIGMA_M)
-
-
-def within(a: F64, b: F64, metres: float, radians: float) -> bool:
-    """Whether two poses (4, 4) differ by less than a translation and a rotation."""
-    moved, turned = se3.extent(se3.inverse(a) @ b)
-    return bool(moved < metres and turned < radians)

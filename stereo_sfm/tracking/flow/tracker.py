@@ -35,7 +35,7 @@ from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.readout import ReadoutSearch
-from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery, within
+from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery
 from stereo_sfm.tracking.flow.rolling_shutter import MIN_INTERVAL_S, RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
@@ -462,7 +462,7 @@ class Tracker:
         tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
         for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
-            if not any(within(pose, other, *SAME_START) for other in tried):
+            if not any(se3.within(pose, other, *SAME_START) for other in tried):
                 tried.append(pose)
                 tracks, solution = self._track_from(pose, images, seconds, refined)
                 if solution.reason:
@@ -512,7 +512,7 @@ class Tracker:
             motion = ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
             tracks = self._match_right(self._follower.find_again(images.left, pose, reach, most), images, motion)
             solution = self._solver.solve_again(tracks, motion)
-            if solution.reason or any(within(solution.pose, other, *SAME_PLACE) for other in known):
+            if solution.reason or any(se3.within(solution.pose, other, *SAME_PLACE) for other in known):
                 return NOT_FOUND
             pose, known = solution.pose, ()
         return tracks, solution

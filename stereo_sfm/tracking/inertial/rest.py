@@ -34,9 +34,9 @@ class Rest:
             self._seen.popleft()
         held, (first_ns, first) = self._held, self._seen[0]
         if held is None:
-            still = stamp_ns - first_ns >= STILL_NS and _within(first, odom_T_cam, SEEN)
+            still = stamp_ns - first_ns >= STILL_NS and se3.within(first, odom_T_cam, *SEEN)
         else:
-            still = _within(held, odom_T_cam, HELD)
+            still = se3.within(held, odom_T_cam, *HELD)
         if not still or not sensors_still():
             self._held, self._count = None, 0
             return odom_T_cam
@@ -51,8 +51,3 @@ class Rest:
         """The odometry begins anew."""
         self._seen.clear()
         self._held, self._count = None, 0
-
-
-def _within(a: F64, b: F64, limits: tuple[float, float]) -> bool:
-    metres, radians = se3.extent(se3.inverse(a) @ b)
-    return bool(metres < limits[0] and radians < limits[1])
