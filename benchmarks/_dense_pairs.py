@@ -1,8 +1,9 @@
-"""Rows of `benchmarks dense` from single pairs with ground truth, beside OpenCV's matcher alone."""
+"""Rows of `benchmarks dense` from single pairs with ground truth, beside OpenCV's matcher alone, and of live depth."""
 
 from __future__ import annotations
 
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,25 @@ from typing import Any
 import cv2
 import numpy as np
 from _verdicts import Verdicts
+from pipeline import RATE, Numbers, opened
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.config import DenseConfig
+from stereo_sfm.config import Config, DenseConfig
 from stereo_sfm.dense.depth import disparities, pair_depth
 from stereo_sfm.dense.live import LiveDepthMaker
 from stereo_sfm.dense.views import stereo_view
+from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.geometry.cameras import KannalaBrandt
+from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.types import F32, F64, U8, Bool, StereoImage
 
 PAIRS = 24  # in store_pairs
 NEAR_M = 2.5  # shelves as a robot sees them
 SIGMAS = 61, 75  # percent of errors within one standard deviation: 68 +- 7
 RATE_HZ = 5  # of live depth
+BLOCK = 150  # images, with or without live depth in turn
+LAP = 5 * BLOCK  # of a sequence there and back; an odd number of blocks, so that two laps have each image both ways
+LAPS = 9  # the first makes the map, and is not counted
 
 
 def sgbm(left: U8, right: U8, count: int) -> F32:
@@ -45,8 +52,8 @@ def _pair(
     least = np.sort(sigma[used])[: int(both.sum())][-1]  # the same density
     error, other = np.abs(found - truth)[used & (sigma <= least)], np.abs(base - truth)[both]
     for what, most, (ours, theirs) in (
-        (f"median at most {goal[0]} px", goal[0], (float(np.median(e)) for e in (error, other))),
-        (f"at most {goal[1]} % beyond 2 px", goal[1], (100 * float((e > 2).mean()) for e in (error, other))),
+        (f"median ≤ {goal[0]} px", goal[0], (float(np.median(e)) for e in (error, other))),
+        (f"≤ {goal[1]} % beyond 2 px", goal[1], (100 * float((e > 2).mean()) for e in (error, other))),
     ):
         density = 100 * both.sum() / known.sum()
         text = f"{ours:.3f} at {density:.0f} % density; SGBM {theirs:.3f}"
@@ -105,7 +112,7 @@ def store_pairs(verdicts: Verdicts, folder: Path, count: int) -> None:
     text = "{:.2f} % at {:.0f} % density".format
     figures = [text(100 * np.median(e), 100 * len(e) / near_pixels) for e in (ours, theirs)]
     middle = 100 * float(np.median(ours))
-    verdicts.row(f"{name}: median at most 2 % within 2.5 m", middle <= 2, f"{figures[0]}; SGBM {figures[1]}")
+    verdicts.row(f"{name}: median ≤ 2 % within 2.5 m", middle <= 2, f"{figures[0]}; SGBM {figures[1]}")
     _held(verdicts, name, np.concatenate(held))
 
 
@@ -119,7 +126,27 @@ def live(verdicts: Verdicts, folder: Path, count: int) -> None:
         maker.step(StereoImage(k, k, left, right))
         times.append(time.process_time() - began)
     share = 100 * RATE_HZ * float(np.median(times[1:]))  # the first compiles
-    verdicts.row("live depth 424x400 at 5 Hz: at most 25 % of a core", share <= 25, f"{share:.0f} %")
+    verdicts.row("live depth 424x400 at 5 Hz: ≤ 25 % of a core", share <= 25, f"{share:.0f} %")
+
+
+def latencies(verdicts: Verdicts) -> None:
+    """Of the poses of one run in real time, each image as often with live depth as without."""
+    source = MadeSource.of(opened, f"sim:loop?frames={LAP // 2 + 1}", LAPS * LAP, True)
+    on = np.arange(LAPS * LAP) // BLOCK % 2 == 1
+    chosen = frozenset(k for k in np.flatnonzero(on).tolist() if k % round(RATE / RATE_HZ) == 0)
+    numbers = Numbers()
+    with ProcessRun(source, Config(dense=DenseConfig(live=True)), [numbers], depth_frames=chosen) as run:
+        for _ in run:
+            pass
+    ms = numbers.ms["latency"]
+    known = [k for k in ms if k >= LAP]
+    without, with_it = ([ms[k] for k in known if on[k] == depth] for depth in (False, True))
+    print(f"{len(numbers.ms['depth'])} of {len(chosen)} depth images, {numbers.dropped} dropped", file=sys.stderr)
+    for what, percent, most in ("at the median", 50, 1), ("at 95 %", 95, 3):
+        a, b = np.percentile(without, percent), np.percentile(with_it, percent)
+        verdicts.row(
+            f"poses beside live depth: ≤ {most} ms later {what}", bool(b - a <= most), f"{b:.2f} ms; alone {a:.2f} ms"
+        )
 
 
 def _names(folder: Path, count: int) -> list[Path]:

@@ -22,6 +22,7 @@ import os
 import sys
 import tempfile
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -55,13 +56,14 @@ class Numbers:
     """Sink that collects the stages' statistics."""
 
     def __init__(self) -> None:
-        self.latency: list[float] = []
+        self.ms: defaultdict[str, dict[int, float]] = defaultdict(dict)  # of each frame
         self.dropped = self.loops = 0
         self.health: dict[str, Health] = {}
 
     def put(self, message: object) -> None:
-        if isinstance(message, StageTimes) and "latency" in message.ms:
-            self.latency.append(message.ms["latency"])
+        if isinstance(message, StageTimes):
+            for what, ms in message.ms.items():
+                self.ms[what][message.frame_id] = ms
         elif isinstance(message, Dropped):
             self.dropped += message.count
         elif isinstance(message, LoopResult):
@@ -101,7 +103,7 @@ def play(path: str, frames: int, paced: bool, folder: Path, images: str = "raw")
     print(f"{mode}: {done} of {frames} frames, {done / seconds:.1f} frames/s, {numbers.dropped} dropped")
     print(f"  {numbers.loops} loops closed")
     if paced:
-        p50, p95, p99 = np.percentile(numbers.latency[30:], (50, 95, 99))
+        p50, p95, p99 = np.percentile(list(numbers.ms["latency"].values())[30:], (50, 95, 99))
         print(f"  image to pose: p50 {p50:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms")
     for stage, health in sorted(numbers.health.items()):
         print(f"  {stage}: p50 {health.p50_ms:.1f} ms, p95 {health.p95_ms:.1f} ms, {health.rate:.1f} a second")
