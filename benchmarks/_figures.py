@@ -97,8 +97,9 @@ def table(path: Path) -> list[str]:
         cells = [found[sequence, one].text() if (sequence, one) in found else "" for one in columns]
         lines.append(f"| {sequence} | " + " | ".join(cells) + " |")
     versions = ", ".join(f"{key} {value}" for key, value in (made["versions"] or {}).items())
-    how = "one run each" if runs == [1] else f"{' or '.join(map(str, runs))} runs each"
-    about = f"`{made['command']}`, {how}. Commit {made['commit']}, {made['date']}; {made['machine']}"
+    how = "" if runs == [1] else f", {' or '.join(map(str, runs))} runs each"
+    name = made["command"].removeprefix("python -m benchmarks ")
+    about = f"`{name}`{how}. Commit {made['commit']}, {made['date']}; {made['machine']}"
     lines += ["", about + (f"; {versions}." if versions else "."), ""]
     return lines
 

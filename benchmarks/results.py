@@ -18,12 +18,10 @@ HEAD = """\
 # Results
 
 What holds today. Each table is made from the figures of one benchmark by `python -m benchmarks results`.
-Below it stand the command, the commit, the machine and the versions. Figures move from run to run: ± is their
-standard deviation.
+Below it stand what `python -m benchmarks` ran (once unless stated), the commit, the machine and the versions. Figures
+move from run to run: ± is their standard deviation.
 
-**ATE** is the root mean square of the position error after alignment. SE(3) alignment keeps the size of the path;
-Sim(3) alignment also scales it. **Row error** and the other terms are in the [glossary](glossary.md).
-How the figures came about is in the [lab notebook](notebook.md).
+The terms are in the [glossary](glossary.md); how the figures came about is in the [lab notebook](notebook.md).
 """
 RELEASE = """\
 # Figures of {version}
