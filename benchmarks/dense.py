@@ -34,7 +34,7 @@ REAL = {"euroc_mh01": "euroc_mh01", "kitti": "kitti", "library_walk": "library_w
 TESTS = {
     "the same bits inline, in processes and again": ["tests/dense/test_build.py", "tests/pipeline/test_live_depth.py"],
     "a costmap by the rules of map_server": ["tests/dense/test_costmap.py"],
-    "/obstacles received by a node of ROS 2": ["tests/service/test_ros2.py"],
+    "/obstacles received by a node of ROS 2": ["tests/service/test_ros2.py::test_nodes_receive_depth_and_obstacles"],
     "pycolmap fuses the COLMAP export": ["tests/dense/test_colmap.py"],
 }
 PARTS = ("motorcycle", "aloe", "pairs", "fisheye", "pinhole", *REAL, "live", "tests")
