@@ -43,7 +43,7 @@ PARTS = ("motorcycle", "aloe", "pairs", "fisheye", "pinhole", *REAL, "live", "te
 def _tests(verdicts: Verdicts) -> None:
     """What tests show; a test that was left out shows nothing."""
     for sentence, files in TESTS.items():
-        command = [sys.executable, "-m", "pytest", "-q", "-n", "0", *files]
+        command = [sys.executable, "-m", "pytest", "-n", "0", *files]
         done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True)
         last = (done.stdout.strip().splitlines() or ["no output"])[-1].strip("= ")
         verdicts.row(sentence, done.returncode == 0 and "skipped" not in last, last.partition(" in ")[0])
