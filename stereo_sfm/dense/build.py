@@ -24,7 +24,7 @@ from stereo_sfm.dense.depth import DepthImage
 from stereo_sfm.dense.inputs import DenseInput, keyframes
 from stereo_sfm.dense.keyframe_depth import KeyframeImages, keyframe_depth, with_partners
 from stereo_sfm.dense.surface import LEAST_VIEWS, Surface, extract
-from stereo_sfm.dense.volume import SIDE, Seen, contributes, fuse, touched
+from stereo_sfm.dense.volume import CACHED, SIDE, Seen, contributes, fuse, touched
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import MODELS
@@ -38,7 +38,6 @@ VERSION = "6"  # of the files: grows when the same input gives other bits
 CubeIndex = tuple[int, int, int]
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)
-CACHED = 64  # depth images in memory of a process, 2 to 4 MB each
 Report = Callable[[str, int, int], None]  # what, done, of
 
 

@@ -30,6 +30,7 @@ TRUNCATION = 4  # voxels before and behind a surface
 SESSIONS = 3  # newest ones that count
 TILE = 8  # px, of the coarse image of largest ranges
 BLOCK = 11  # voxels a side that are left out or projected together; 66 is a multiple
+CACHED = 256  # depth images in memory of a process, less than 1 MB each: those that see one cube are 70 to 90
 BENT_PX = 2.0  # second differences of projections over a block: up to here parabolas are right to a tenth of a pixel
 
 
@@ -112,7 +113,7 @@ def _used(depth: DepthImage, voxel: float) -> Bool:
     return depth.sigmas <= TRUNCATION * voxel
 
 
-@lru_cache(64)
+@lru_cache(CACHED)
 def _farthest_of_tiles(depth: DepthImage, voxel: float) -> F32:
     """Largest range of each tile that is used, 0 where there is none."""
     height, width = depth.ranges.shape
