@@ -44,7 +44,7 @@ def _nothing_moves(original: Callable[..., Any]) -> Callable[..., Any]:
     """`after_frame` that marks no point as moving."""
 
     def after_frame(tracks: Any, inlier: Any, moving: Any, misses_allowed: int, alert: bool, static: int) -> Any:
-        return original(tracks, inlier, moving[:0], misses_allowed, False, static)
+        return original(tracks, inlier, moving & False, misses_allowed, False, static)
 
     return after_frame
 
