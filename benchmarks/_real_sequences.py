@@ -95,6 +95,9 @@ _AS_THEY_ARE = (
     Sequence("kitti_raw_0926", "kitti_raw_0926_1310"),
     Sequence("seven_scenes", "seven_scenes", rate_hz=30.0, kind="depth", rig="seven_scenes_rig.yaml"),
     Sequence("backyard", "backyard_bumblebee", rate_hz=12.0),
+    # Of SihanWang-WHU/Stereo_VO and BhavyanshM/StereoVisualOdometry, laid out as KITTI; the car drives at each start.
+    Sequence("kitti_03", "kitti_03/sequences/03", starts_s=(0.0, 1.0, 2.0, 3.0, 4.8, 5.0, 5.4)),
+    Sequence("kitti_00_start", "kitti_00_start/sequences/00", starts_s=(0.0, 1.0, 2.0, 3.0, 5.0)),
     Sequence("karlsruhe_part", "karlsruhe_part", rate_hz=9.5, shared=True),
     Sequence("kitti_00_part", "kitti", rate_hz=9.65, shared=True, best_cpp="0.319 m", long=True),
     Sequence("euroc_mh01_part", "euroc_mh01", rate_hz=20.0, shared=True, kind="inertial", best_cpp="4.6 mm", long=True),
