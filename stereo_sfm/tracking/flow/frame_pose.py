@@ -265,7 +265,7 @@ class FramePoseSolver:
         by_static, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (long, near))
         found = [agreed, by_static, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
-        if not self.alert and agreed is not None and not any(s is agreed for s in plausible):
+        if not self.alert and agreed is not None and not self._plausible(agreed.pose, expected):
             # Points that agree with the best pose, too, are no evidence of another: the prediction is wrong.
             plausible = [s for s in plausible if (s.inlier & static & ~best.inlier).sum() >= MIN_GROUP]
         if not plausible:
