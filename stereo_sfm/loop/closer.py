@@ -40,9 +40,9 @@ from stereo_sfm.loop.verification import (
     verify_near,
 )
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.correction import DRIFT
 from stereo_sfm.mapping.culling import OF_A_VIEW, OF_EARLIER_VISITS, PASSED
 from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.flow.motion_prior import DRIFT
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
 PLACE_RADIUS = 3  # keyframes: of candidates at most so many apart, which are one place, only the best is verified

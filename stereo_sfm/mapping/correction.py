@@ -22,14 +22,14 @@ from stereo_sfm.mapping.level import weights
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_graph import Edges, Gravity, edges_of_poses, join, optimise
 from stereo_sfm.mapping.side_points import join_corners
+from stereo_sfm.tracking.flow.motion_prior import DRIFT
 from stereo_sfm.types import F64, I64, LoopResult
 
 COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph: as many as a loop must have
-# Standard deviation of an odometry edge, metres and radians per metre, of good tracking; and its systematic part.
+# Standard deviation of an odometry edge, metres and radians per metre, of good tracking; DRIFT is its systematic part.
 ODOMETRY = 0.004, 0.0006
 MAX_STRAIN = 6.0  # sigmas^2 that a loop may keep: chi-squared of six degrees of freedom has this mean
 MAX_NOISE = chi_squared(6, 0.95)  # sigmas^2: noise exceeds that in one of twenty loops
-DRIFT = 0.003, 0.0003  # of scale and heading: metres and radians per metre of the path
 LOOP_SIGMAS = 0.01, 0.003  # metres, radians, smallest standard deviation of a loop: its points are not independent
 
 

@@ -119,8 +119,8 @@ def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
     solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), shutter)
     shutter.use(0.01)  # that the rig's is wrong may turn out in the run
     shutter.project(np.eye(4), np.zeros(6), np.ones((1, 3)), uv)
-    solution = no_pose(0, "")
-    solver.shift_chi2(Tracks(), solution)
+    solution, none = no_pose(0, ""), np.zeros(0, bool)
+    solver.shift_chi2(Tracks(), none, solution, np.zeros(6))
     solver.influence(Tracks(), solution)
     if rig.imu is not None and config.tracker.inertial:
         _warm_up_inertial(rig.imu)

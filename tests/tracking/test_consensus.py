@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.flow import frame_pose
 from stereo_sfm.tracking.flow.consensus import Movers, after_frame, static_frames
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
@@ -212,6 +214,33 @@ def test_new_points_among_moving_ones_are_not_believed_where_the_pose_rests_on_t
         assert off(taken_along.pose) > 0.003
         mended += off(solver.solve(tracks, start, np.eye(4), before=len(tracks)).pose) < 0.003
     assert mended >= 12
+
+
+def before_wrong_distances(rng: np.random.Generator) -> Tracks:
+    """A car drives past what is near, towards what it has seen for 9 m, with a rig that is 0.05 degrees off."""
+    tracks = scene(rng)[0]
+    n, far = len(tracks), np.arange(len(tracks)) < 120
+    depth = np.where(far, rng.uniform(25.0, 60.0, n), rng.uniform(5.0, 9.0, n))
+    points = depth[:, None] * np.column_stack([rng.uniform([-0.5, -0.2], [0.5, 0.2], (n, 2)), np.ones(n)])
+    tracks.origin = np.where(far[:, None], [0.0, 0.0, -9.0], [0.0, 0.0, -1.0])
+    distance = np.linalg.norm(points - tracks.origin, axis=1)
+    tracks.direction = (points - tracks.origin) / distance[:, None]
+    tracks.rho = 1 / distance + math.radians(0.05) / RIG.baseline
+    tracks.variance, tracks.age = np.full(n, 1e-6), np.where(far, 15, 1).astype(np.int32)
+    tracks.uv, tracks.uv_right = RIG.left.project(points) + rng.normal(0, 0.2, (n, 2)), np.full((n, 2), np.nan)
+    return tracks
+
+
+def test_an_error_of_the_rig_is_not_somebody_near_who_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that were tracked for long contradict new near points, by as much as distances err together."""
+    for seed in range(10):
+        tracks = before_wrong_distances(np.random.default_rng(seed))
+        expected = ExpectedMotion(se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
+        solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+        assert not solver.solve(tracks, expected, np.eye(4), before=len(tracks)).moving.any()
+        with monkeypatch.context() as patch:
+            patch.setattr(frame_pose, "RIG_SIGMA", 0.0)
+            assert solver.solve(tracks, expected, np.eye(4), before=len(tracks)).moving.any()
 
 
 def few_points(rng: np.random.Generator, moved: F64) -> Tracks:

@@ -27,6 +27,7 @@ from stereo_sfm.tracking.flow.consensus import (
     beside_moving,
     in_group,
 )
+from stereo_sfm.tracking.flow.motion_prior import DRIFT
 from stereo_sfm.tracking.flow.pose_solver import SeenPoints
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -46,10 +47,12 @@ USUAL_DIFFERENCES = (0.002, 1.0), (0.002, 1.5)
 UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
-# the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they move it
-# away: by 14 at most in 700 images of stores without people and of EuRoC. If by more than has 1 % of six degrees of
-# freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
+# the points known for long by this factor are asked by how many squared sigmas of noise, drift and the rig's error they
+# move it away. If by more than has 1 % of six degrees of freedom, 5 % beside moving points, they are compared with the
+# pose by the known ones: a point is wrong from so many sigmas on.
 NEARER, WRONG_SIGMAS = 1.25, 2.0
+# Of the right camera's rotation, with which all distances err: 0 to 0.09 degrees in 15 published calibrations.
+RIG_SIGMA = math.radians(0.05)
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a degree of freedom of a pose may rest
@@ -184,16 +187,22 @@ class FramePoseSolver:
         if known is None:
             return None
         near = static & ~known & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[known]))
-        near = self._shifting(tracks, near, MIN_GROUP, best)
-        doubtful = self._shifting(tracks, doubtful, 1, best)
+        way = median(np.linalg.norm(best.pose[:3, 3] - tracks.origin[known], axis=1))
+        drift = np.repeat(np.square(np.multiply(DRIFT, way)), 3)
+        if np.count_nonzero(near) < MIN_GROUP or self.shift_chi2(tracks, near, best, drift) < chi_squared(6):
+            near[:] = False
+        if not doubtful.any() or self.shift_chi2(tracks, doubtful, best, drift) < chi_squared(6, 0.95):
+            doubtful[:] = False
         suspected = near | doubtful
         if not suspected.any():
             return None
         by_known = self._optimise(tracks, expected.to(best.pose), known)
         if by_known.inlier[known].sum() < AGREEING_SHARE * known.sum():
             return None
+        moved = by_known.covariance @ self._by_common_rho(tracks.keep(known), by_known)
+        spread = by_known.covariance + np.diag(drift) + self._rho_sigma**2 * np.outer(moved, moved)
         off = np.zeros(len(tracks), bool)
-        off[suspected] = self.influence(tracks.keep(suspected), by_known)[1] > WRONG_SIGMAS
+        off[suspected] = self.influence(tracks.keep(suspected), replace(by_known, covariance=spread))[1] > WRONG_SIGMAS
         wrong = doubtful | off if in_group(tracks, off & near).any() else doubtful
         if not wrong.any():
             return None
@@ -207,11 +216,6 @@ class FramePoseSolver:
             if np.count_nonzero(known) >= 2 * self._config.min_features:
                 return known
         return None
-
-    def _shifting(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
-        """(N,) the `points` (N,), if they are so many and shift the pose from where all others have it; else none."""
-        shifting = np.count_nonzero(points) >= least and self.shift_chi2(tracks.keep(points), best) >= chi_squared(6)
-        return points & shifting
 
     def _judge(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, before: int
@@ -434,9 +438,24 @@ class FramePoseSolver:
         """`pose_solver.influence` of points on a pose."""
         return pose_solver.influence(*self._at(solution, tracks))
 
-    def shift_chi2(self, tracks: Tracks, solution: PoseSolution) -> float:
-        """`pose_solver.shift_chi2` of some points."""
-        return pose_solver.shift_chi2(*self._at(solution, tracks))
+    def shift_chi2(self, tracks: Tracks, points: Bool, s: PoseSolution, drift: F64) -> float:
+        """`pose_solver.shift_chi2` of some points (N,) and the other static ones."""
+        parts = (self._seen(tracks.keep(rows)) for rows in (points, ~tracks.moving & ~points))
+        return pose_solver.shift_chi2(
+            s.pose, s.velocity, s.covariance, *parts, self.cameras, s.sigma_px, CAUCHY_SCALES[-1], drift,
+            self._rho_sigma,
+        )  # fmt: skip
+
+    def _by_common_rho(self, tracks: Tracks, s: PoseSolution) -> F64:
+        """`pose_solver.by_common_rho` of some points."""
+        return pose_solver.by_common_rho(
+            s.pose, s.velocity, self._seen(tracks), self.cameras, s.sigma_px, CAUCHY_SCALES[-1]
+        )
+
+    @property
+    def _rho_sigma(self) -> float:
+        """1/m, of all inverse distances together, by an error of the rig."""
+        return RIG_SIGMA / float(np.linalg.norm(self.cameras.left_T_right[:3, 3]))
 
     def _at(self, s: PoseSolution, tracks: Tracks) -> tuple[F64, F64, F64, SeenPoints, StereoCameras, float, float]:
         """A pose and points as arguments of the kernels."""

@@ -21,6 +21,7 @@ WINDOW_S = 1.0  # of motion whose mean is the velocity
 RETURN_S, SPREAD = np.array([4.0, 1.0]), np.array([0.8, 0.7])
 FIRST_SIGMAS = np.array([0.01, 0.005])  # metres, radians: of the last trusted pose and its velocity
 STEADY = np.array([0.05, 0.05])  # m/s, rad/s, standard deviations of a motion that goes on as before
+DRIFT = 0.003, 0.0003  # of scale and heading, of good tracking: metres and radians per metre of the path
 TURN_STEP = np.deg2rad(20.0)  # radians between turns that are tried
 
 

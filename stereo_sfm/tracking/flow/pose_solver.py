@@ -364,12 +364,38 @@ def influence(pose, velocity, covariance, points, cameras, sigma, scale):
 
 
 @njit
-def shift_chi2(pose, velocity, covariance, points, cameras, sigma, scale):
+def by_common_rho(pose, velocity, points, cameras, sigma, scale):
+    """(6,) change of a pose's gradient, with the distances eliminated, if every inverse distance is too large by 1/m.
+
+    An error of the rig does that. Arguments as of `optimise_pose`, the last Cauchy scale.
+    """
+    rho, variance = points.rho, points.variance
+    res, jac, ray, change = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros(6)
+    row, step = pose.copy(), np.zeros((4, 4))
+    for k in range(len(rho)):
+        rows = _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray)
+        rr, gr, gg = 0.0, 0.0, 0.0
+        for i in range(rows):
+            rr += res[i] * res[i]
+            gr += ray[i] * res[i]
+            gg += ray[i] * ray[i]
+        seen = sigma * sigma + variance[k] * gg
+        chi2 = max(rr - variance[k] / seen * gr * gr, 0.0) / (sigma * sigma)
+        weight = 1.0 / (seen * (1.0 + chi2 / (max(rows, 1) * scale * scale)))
+        for a in range(6):
+            for i in range(rows):
+                change[a] += weight * jac[i, a] * ray[i]
+    return change
+
+
+@njit
+def shift_chi2(pose, velocity, covariance, points, others, cameras, sigma, scale, drift, rho_sigma):
     """How far from a pose, with covariance (6, 6), the others alone would have it than some `points`, in squared
     sigmas; inf if it rests on these.
 
     To first order: at a pose by all, the gradients of these and of the others cancel each other. Arguments as of
-    `optimise_pose`, the last Cauchy scale.
+    `optimise_pose`, the last Cauchy scale; besides noise, all inverse distances err by one `rho_sigma`, 1/m, and the
+    pose by the others has the variances `drift` (6,).
     """
     n = 12 if len(points.row_s) > 0 else 6
     normal, rhs, inverse, factor = np.zeros((n, n)), np.zeros(n), np.full((6, 6), np.inf), np.zeros((6, 6))
@@ -386,10 +412,19 @@ def shift_chi2(pose, velocity, covariance, points, cameras, sigma, scale):
             rhs[i] -= (y * rhs[6:]).sum()
             for j in range(6):
                 normal[j, i] -= (normal[j, 6:] * y).sum()
+    shift = by_common_rho(pose, velocity, points, cameras, sigma, scale)
+    moved = shift + by_common_rho(pose, velocity, others, cameras, sigma, scale)
     for i in range(6):
         for j in range(6):
             inverse[i, j] -= normal[i, j]
-    if not solve_symmetric(inverse, rhs[:6].copy(), x, factor):
+            for k in range(6):
+                shift[i] -= normal[i, k] * covariance[k, j] * moved[j]
+    spread = inverse + rho_sigma * rho_sigma * np.outer(shift, shift)
+    for i in range(6):
+        for j in range(6):
+            for k in range(6):
+                spread[i, j] += inverse[i, k] * drift[k] * inverse[k, j]
+    if not solve_symmetric(spread, rhs[:6].copy(), x, factor):
         return math.inf
     total = 0.0
     for i in range(6):
