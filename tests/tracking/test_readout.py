@@ -19,9 +19,10 @@ from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import RadTan
+from stereo_sfm.tracking.flow import readout
 from stereo_sfm.tracking.flow.readout import MIN_PAIRS, Readout, ReadoutSearch
 from stereo_sfm.tracking.flow.tracker import Tracker
-from stereo_sfm.types import StereoImage
+from stereo_sfm.types import F64, StereoImage
 
 SLOW = pytest.mark.slow  # four seconds each
 AISLE = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40"
@@ -45,6 +46,11 @@ def search(
     for image in images[begin:]:
         tracker.step(image)
     return found.measured
+
+
+def skew(points: F64) -> F64:
+    """(N, 3, 3) matrices of the cross products with points (N, 3)."""
+    return np.cross(points[:, :, None], np.eye(3)[None], axisa=1, axisb=1, axisc=1)
 
 
 def turned(axis: int, degrees: float) -> Callable[[Rig], Rig]:
@@ -106,6 +112,23 @@ def test_a_global_shutter_is_recognised_with_any_calibration(change: Callable[[R
 def test_a_steady_drive_with_a_wrong_calibration_shows_no_readout() -> None:
     """In straight motion, wrong disparities have the same effect as a rolling shutter."""
     assert search(f"{AISLE}&frames=60&rate=10", 0.0, turned(1, -0.4)).best_s == 0.0
+
+
+@pytest.mark.parametrize("readout_s", [0.0, 0.02])
+def test_distances_that_all_err_are_no_readout(readout_s: float) -> None:
+    """On a road what is near is low in the image: flow that is wrong by distance looks like rows at other times."""
+    rng = np.random.default_rng(0)
+    camera = RadTan(1241, 376, 718.9, 718.9, 607.2, 185.2)
+    points = np.column_stack([rng.uniform(-8, 8, 150), np.full(150, 1.6), rng.uniform(6, 60, 150)])
+    velocity, change = np.array([0.3, 0.1, 10.0, 0.01, 0.4, 0.0]), np.array([0.5, 0.1, 1.0, 0.05, 0.1, 0.02])
+    uv, by_point = camera.project_jacobian(points)
+    row = uv[:, 1] / (camera.height - 1) - 0.5
+    by_pose = np.einsum("nij,njk->nik", by_point, np.concatenate([np.tile(-np.eye(3), (150, 1, 1)), skew(points)], 2))
+    wrong = 0.1 * 0.002 * np.linalg.norm(points, axis=1)  # of 0.1 s, with inverse distances 0.002 too large
+    moved = wrong[:, None] * (by_pose[:, :, :3] @ velocity[:3])
+    moved += readout_s * row[:, None] * (by_pose @ change) + rng.normal(0, 0.01, (150, 2))
+    product, square = readout._readout(points, by_point, row, moved, velocity, change)  # pyright: ignore[reportPrivateUsage]
+    assert product / square == pytest.approx(readout_s, abs=0.002)
 
 
 @pytest.mark.slow
