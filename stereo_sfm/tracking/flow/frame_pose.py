@@ -440,17 +440,13 @@ class FramePoseSolver:
 
     def shift_chi2(self, tracks: Tracks, points: Bool, s: PoseSolution, drift: F64) -> float:
         """`pose_solver.shift_chi2` of some points (N,) and the other static ones."""
-        parts = (self._seen(tracks.keep(rows)) for rows in (points, ~tracks.moving & ~points))
-        return pose_solver.shift_chi2(
-            s.pose, s.velocity, s.covariance, *parts, self.cameras, s.sigma_px, CAUCHY_SCALES[-1], drift,
-            self._rho_sigma,
-        )  # fmt: skip
+        others = self._seen(tracks.keep(~tracks.moving & ~points))
+        return pose_solver.shift_chi2(*self._at(s, tracks.keep(points)), others, drift, self._rho_sigma)
 
     def _by_common_rho(self, tracks: Tracks, s: PoseSolution) -> F64:
         """`pose_solver.by_common_rho` of some points."""
-        return pose_solver.by_common_rho(
-            s.pose, s.velocity, self._seen(tracks), self.cameras, s.sigma_px, CAUCHY_SCALES[-1]
-        )
+        pose, velocity, _, *others = self._at(s, tracks)
+        return pose_solver.by_common_rho(pose, velocity, *others)
 
     @property
     def _rho_sigma(self) -> float:

@@ -363,33 +363,35 @@ def influence(pose, velocity, covariance, points, cameras, sigma, scale):
     return leverages, errors
 
 
-@njit
-def by_common_rho(pose, velocity, points, cameras, sigma, scale):
-    """(6,) change of a pose's gradient, with the distances eliminated, if every inverse distance is too large by 1/m.
+@inner
+def _by_common_rho(variance, error, elimination, scale):
+    """(6,) change of the gradient that `normal_equations` gave if all inverse distances were larger by 1/m.
 
-    An error of the rig does that. Arguments as of `optimise_pose`, the last Cauchy scale.
+    An error of the rig does that. variance (N,) of them; error (N,), elimination (N, 7) and scale as they were there.
     """
-    rho, variance = points.rho, points.variance
-    res, jac, ray, change = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros(6)
-    row, step = pose.copy(), np.zeros((4, 4))
-    for k in range(len(rho)):
-        rows = _row_residuals(k, pose, velocity, points, cameras, row, step, res, jac, ray)
-        rr, gr, gg = 0.0, 0.0, 0.0
-        for i in range(rows):
-            rr += res[i] * res[i]
-            gr += ray[i] * res[i]
-            gg += ray[i] * ray[i]
-        seen = sigma * sigma + variance[k] * gg
-        chi2 = max(rr - variance[k] / seen * gr * gr, 0.0) / (sigma * sigma)
-        weight = 1.0 / (seen * (1.0 + chi2 / (max(rows, 1) * scale * scale)))
-        for a in range(6):
-            for i in range(rows):
-                change[a] += weight * jac[i, a] * ray[i]
+    change = np.zeros(6)
+    for k in range(len(variance)):
+        for i in range(6):
+            change[i] += elimination[k, i] / (variance[k] * (1.0 + (error[k] / scale) ** 2))
     return change
 
 
 @njit
-def shift_chi2(pose, velocity, covariance, points, others, cameras, sigma, scale, drift, rho_sigma):
+def by_common_rho(pose, velocity, points, cameras, sigma, scale):
+    """`_by_common_rho` at a pose; arguments as of `optimise_pose`, the last Cauchy scale."""
+    n = 12 if len(points.row_s) > 0 else 6
+    normal, rhs, error, elimination = (
+        np.zeros((n, n)),
+        np.zeros(n),
+        np.empty(len(points.rho)),
+        np.empty((len(points.rho), 7)),
+    )
+    normal_equations(pose, velocity, points, points.rho, cameras, sigma, scale, normal, rhs, error, elimination)
+    return _by_common_rho(points.variance, error, elimination, scale)
+
+
+@njit
+def shift_chi2(pose, velocity, covariance, points, cameras, sigma, scale, others, drift, rho_sigma):
     """How far from a pose, with covariance (6, 6), the others alone would have it than some `points`, in squared
     sigmas; inf if it rests on these.
 
@@ -412,7 +414,7 @@ def shift_chi2(pose, velocity, covariance, points, others, cameras, sigma, scale
             rhs[i] -= (y * rhs[6:]).sum()
             for j in range(6):
                 normal[j, i] -= (normal[j, 6:] * y).sum()
-    shift = by_common_rho(pose, velocity, points, cameras, sigma, scale)
+    shift = _by_common_rho(points.variance, error, elimination, scale)
     moved = shift + by_common_rho(pose, velocity, others, cameras, sigma, scale)
     for i in range(6):
         for j in range(6):
