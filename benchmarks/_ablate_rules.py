@@ -163,7 +163,6 @@ RULES = (
         "if not self._part.wanted(self._follower.reference, image.stamp_ns):\n            return None",
         "return None",
     ),
-    _rule("no new points from a part", TRACKER, "if self._recovery.unobstructed or not uncertain:", "if True:"),
     _rule(
         "the better reference image",
         FOLLOWER,

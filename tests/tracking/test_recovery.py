@@ -320,16 +320,12 @@ def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> Non
     assert not part.improved(np.eye(4), near, 0.5, more)
     assert part.improved(np.eye(4), far, 0.6, few)  # one of the two is wrong: the one by less of the view
     assert not part.improved(np.eye(4), far, 0.5, more)
-    assert not part.uncertain(reference, more, 0)  # 17 mm
-    assert part.uncertain(reference, 4 * more, 0)
-    assert not part.uncertain(other, 4 * more, 0)
     part.end(0.6)
     assert part.wanted(reference, 0)
     part.end(0.7)
     assert not part.wanted(reference, 0)
     part.begin(reference, 0.7, more, 0)
     assert not part.wanted(reference, 0)
-    assert not part.uncertain(reference, 4 * more, 0)
 
 
 def test_a_new_submap_is_tracked_on_although_people_moved_before_it() -> None:

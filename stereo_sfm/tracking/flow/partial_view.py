@@ -17,7 +17,6 @@ from stereo_sfm.types import F64
 
 MORE_RECALL = 0.15  # by which more of the reference points must be found than before
 LASTS_NS = 1_000_000_000  # in which what covers the view has gone by, or stays
-UNCERTAIN_M = 0.02  # standard deviation of a position that new points should not inherit
 CONTRADICTED_SIGMAS = 3.0  # between two positions of which one must be wrong
 
 
@@ -41,10 +40,6 @@ class PartialView:
     def wanted(self, reference: ReferenceImage, stamp_ns: int) -> bool:
         """Whether to look for more points: not for long, and not in an image that became the reference since."""
         return reference is self._reference and stamp_ns <= self._until_ns
-
-    def uncertain(self, reference: ReferenceImage, covariance: F64, stamp_ns: int) -> bool:
-        """Whether a pose with covariance (6, 6) still depends on that part, and is too uncertain for new points."""
-        return self.wanted(reference, stamp_ns) and _sigma_m(covariance) > UNCERTAIN_M
 
     def improved(self, before: F64, after: F64, recall: float, covariance: F64) -> bool:
         """Whether a pose (4, 4) by a share of the reference points replaces the one that it was looked for from.

@@ -176,12 +176,10 @@ class Tracker:
             self._readout.add(image.stamp_ns, self._pose, self._tracks, inlier)
             self._use_readout(self._readout)
         keyframe = None
-        uncertain = self._part.uncertain(self._follower.reference, solution.covariance, image.stamp_ns)
-        if self._recovery.unobstructed or not uncertain:
-            if recovered or self._keyframes.due(self._tracks):
-                keyframe = self._create_keyframe(image, images, solution.covariance, trusted)
-            if keyframe is not None or self._solver.crowded(self._static_count()):
-                self._sparse = images
+        if recovered or self._keyframes.due(self._tracks):
+            keyframe = self._create_keyframe(image, images, solution.covariance, trusted)
+        if keyframe is not None or self._solver.crowded(self._static_count()):
+            self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
         stats |= {} if self._sensors is None else self._sensors.level(self._pose) | self._sensors.use_of_each()
         news = (watched.news() for watched in (self._sudden, self._sensors, self._readout) if watched is not None)
