@@ -222,7 +222,12 @@ RULES = (
     _rule("search in three rounds", TRACKER, "for reach, most in ROUNDS:", "for reach, most in ROUNDS[::2]:"),
     _rule("lost second image begins anew", LOSS, "second or max(", "max("),
     _rule("blurred images", TRACKER, "return blurred if consistent else (tracks, solution)", "return tracks, solution"),
-    _rule("rotation of the whole image", TRACKER, "for anywhere in (False, True):", "for anywhere in ():"),
+    _rule(
+        "rotation of the whole image",
+        TRACKER,
+        "for anywhere in (False, True):",
+        "turned = expected\n        for anywhere in ():",
+    ),
     _rule("rotation from anywhere", TRACKER, "for anywhere in (False, True):", "for anywhere in (False,):"),
     # Windows and stereo.
     _rule("tests give way", STEREO, "good = failed < self._gives_way(failed, needed)", "good = failed < 1.0"),
