@@ -60,6 +60,7 @@ RULES = (
     _rule(
         "confirmed by the map", SOLVER, "if undisturbed and self._confirmed(best,", "if False and self._confirmed(best,"
     ),
+    _rule("confirmed by known points", SOLVER, "if usual and self._confirmed(chosen, known, MIN_GROUP):", "if False:"),
     _rule("implausible motion", SOLVER, "and self._plausible(s.pose, expected)]", "]"),
     _rule("evidence of its own", SOLVER, "and not self._plausible(agreed.pose, expected)", "and False"),
     _rule(

@@ -503,6 +503,19 @@ def test_an_alert_lasts_while_a_group_disagrees() -> None:
     assert not solver.alert
 
 
+@pytest.mark.parametrize("surely_static", [True, False])
+def test_little_of_an_open_view_is_enough_while_what_was_known_before_agrees(surely_static: bool) -> None:
+    tracks, on_person = scene(np.random.default_rng(2))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
+    solver.learn(tracks, solver.solve(tracks, expected, np.eye(4), before=400), expected)
+    assert solver.alert
+    solver.open_view = 200.0
+    left = tracks.keep(~on_person & (np.arange(len(tracks)) < 25))
+    left.age[:] = 20 if surely_static else 1
+    assert (not solver.solve(left, expected, np.eye(4), before=len(left)).reason) == surely_static
+
+
 def test_of_two_results_for_an_image_the_expected_one_is_taken_while_objects_move() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))

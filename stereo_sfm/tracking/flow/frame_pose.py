@@ -239,6 +239,10 @@ class FramePoseSolver:
             return chosen
         if undisturbed and self._confirmed(best, static & tracks.mapped, 2 * self._config.min_features):
             return best
+        known = static & (tracks.mapped | (tracks.age * expected.seconds >= SURE_S))
+        usual = self._likelihood(chosen.pose, expected) > USUAL_LIKELIHOOD
+        if usual and self._confirmed(chosen, known, MIN_GROUP):
+            return chosen
         return no_pose(len(tracks), "too_few_points")
 
     @contextmanager
