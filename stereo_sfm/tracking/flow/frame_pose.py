@@ -232,7 +232,8 @@ class FramePoseSolver:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
         disturbed = self.alert or bool(chosen.moving.any())
-        if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
+        more = chosen.inlier[static].sum() > WEIGHT_RATIO * best.inlier[static].sum()
+        if not (disturbed or more) and self._plausible(best.pose, expected):
             chosen = best
         few = np.count_nonzero(chosen.inlier & static) < MIN_OPEN_SHARE * self.open_view
         if not few or (usual and not disturbed):
@@ -264,10 +265,12 @@ class FramePoseSolver:
         static = ~tracks.moving
         other = self._solve_rest(tracks, expected, last_pose, rest)
         agreed = None if best.reason else self._refit(tracks, expected, best, best.inlier & static, static)
-        long = tracks.age * expected.seconds >= SURE_S
+        known = tracks.age * expected.seconds >= SURE_S
+        if np.count_nonzero(static & known) < self._config.min_features:  # who walks hides what is farther
+            known = tracks.rho < median(tracks.rho[static])
         near = self._errors(tracks, expected.pose, expected.velocity) < 2.0 * self._config.max_error_sigmas
-        by_static, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (long, near))
-        found = [agreed, by_static, other, by_near]
+        by_known, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (known, near))
+        found = [agreed, by_known, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
         if not self.alert and agreed is not None and not self._plausible(agreed.pose, expected):
             # Points that agree with the best pose, too, are no evidence of another: the prediction is wrong.
@@ -313,7 +316,8 @@ class FramePoseSolver:
     def _solve_by(self, tracks: Tracks, expected: ExpectedMotion, by: Bool, static: Bool) -> PoseSolution | None:
         """Solve with a part of the static points, `by` (N,), then with all their inliers; None with too few.
 
-        With those that have been static for long, or that are about where the predicted motion takes them.
+        With those that have been static for long, while none has with the farther half, or with those that are about
+        where the predicted motion takes them.
         """
         if by.sum() < self._config.min_features or by[static].all():
             return None
