@@ -362,7 +362,7 @@ def configuration(work: Path) -> RobotConfig:
     token.touch(0o600)
     token.write_text(TOKEN)
     return RobotConfig(
-        map=MapConfig(str(work / "store"), "extend", 5.0),
+        map=MapConfig(str(work / "store"), "extend", save_every_min=5.0),
         recording=RecordingConfig(
             folder=str(work / "recordings"), mode="black_box", image_format="raw", segment_min=SEGMENT_MIN,
             mark_losses=False, quota_gb=QUOTA_GB, min_free_gb=0.05, black_box_min=1.0,
