@@ -35,26 +35,26 @@ RULES = (
     _rule(
         "motion of long-static points",
         SOLVER,
-        "found = [agreed, by_known, other, by_near]",
+        "found = [agreed, by_surest, other, by_near]",
         "found = [agreed, other, by_near]",
     ),
     _rule(
         "motion of far points",
         SOLVER,
-        "if np.count_nonzero(static & known) < self._config.min_features:  # who",
+        "if np.count_nonzero(static & surest) < self._config.min_features:  # who",
         "if False:  # who",
     ),
     _rule(
         "motion of points near the prediction",
         SOLVER,
-        "found = [agreed, by_known, other, by_near]",
-        "found = [agreed, by_known, other]",
+        "found = [agreed, by_surest, other, by_near]",
+        "found = [agreed, by_surest, other]",
     ),
     _rule(
         "motion of the rest",
         SOLVER,
-        "found = [agreed, by_known, other, by_near]",
-        "found = [agreed, by_known, by_near]",
+        "found = [agreed, by_surest, other, by_near]",
+        "found = [agreed, by_surest, by_near]",
     ),
     _rule(
         "unusual motion is doubted",

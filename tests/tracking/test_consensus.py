@@ -58,6 +58,14 @@ def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
     return tracks, on_person
 
 
+def put(rng: np.random.Generator, tracks: Tracks, before: F64, now: F64, noise_px: float = 0.2) -> None:
+    """Points that were at `before` (N, 3) in the last frame's camera are seen at `now` (N, 3) in this one's."""
+    distance = np.linalg.norm(before, axis=1)
+    tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
+    tracks.uv = RIG.left.project(now) + rng.normal(0, noise_px, (len(now), 2))
+    tracks.uv_right = RIG.project_right(now) + rng.normal(0, noise_px, (len(now), 2))
+
+
 def off(pose: F64) -> float:
     """Metres from the truth."""
     return float(se3.extent(se3.inverse(MOVED) @ pose)[0])
@@ -108,11 +116,8 @@ def test_points_that_agree_with_both_motions_are_no_evidence_of_rest(seed: int) 
     depth = np.where(far, rng.uniform(300.0, 600.0, 130), rng.uniform(6.0, 25.0, 130))
     before = depth[:, None] * np.column_stack([rng.uniform([-0.5, -0.3], [0.5, 0.3], (130, 2)), np.ones(130)])
     before[far] *= [0.2, 0.2, 1.0]
-    now, distance = se3.transform(se3.inverse(driven), before), np.linalg.norm(before, axis=1)
-    assert RIG.right is not None
-    tracks.direction, tracks.rho, tracks.age = before / distance[:, None], 1 / distance, np.zeros(130, np.int32)
-    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.1, (130, 2))
-    tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.1, (130, 2))
+    put(rng, tracks, before, se3.transform(se3.inverse(driven), before), 0.1)
+    tracks.age = np.zeros(130, np.int32)
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     solution = solver.solve(tracks, ExpectedMotion(np.eye(4), np.zeros(6), 0.1), np.eye(4), before=140)
     assert float(se3.extent(se3.inverse(driven) @ solution.pose)[0]) < 0.1
@@ -128,11 +133,9 @@ def test_in_the_first_images_the_motion_of_far_points_is_tried() -> None:
         person = rng.uniform([-0.6, -0.5, 1.2], [0.6, 0.5, 1.8], (count, 3))
         before = np.concatenate([store, person])
         moved = np.concatenate([store, person + rng.normal([0.045, 0.0, 0.0], 0.01, (count, 3))])
-        now, distance = se3.transform(se3.inverse(turned), moved), np.linalg.norm(before, axis=1)
         tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < STILL + count)
-        tracks.direction, tracks.rho, tracks.age = before / distance[:, None], 1 / distance, np.ones_like(tracks.age)
-        tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (len(now), 2))
-        tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.2, (len(now), 2))
+        put(rng, tracks, before, se3.transform(se3.inverse(turned), moved))
+        tracks.age = np.ones_like(tracks.age)
         solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
         at_rest = ExpectedMotion(np.eye(4), np.zeros(6), SECONDS)
         solution = solver.solve(tracks, at_rest, np.eye(4), before=len(tracks))
@@ -140,7 +143,7 @@ def test_in_the_first_images_the_motion_of_far_points_is_tried() -> None:
     assert right >= 9
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_person_followed_for_as_long_as_the_store_does_not_take_the_pose_along(seed: int) -> None:
     """Who stood before the camera has the older points, and more of them; at the first step the camera goes on."""
     tracks, on_person = scene(np.random.default_rng(seed))
@@ -164,13 +167,9 @@ def test_a_person_who_steps_aside_slowly_does_not_shift_the_pose(seed: int) -> N
     tracks, on_person = scene(rng)
     kept = np.arange(len(tracks)) < STILL + 30
     tracks, on_person = tracks.keep(kept), on_person[kept]
-    assert RIG.right is not None
     before: F64 = np.where(on_person[:, None], tracks.points(), [0.0, 0.0, 4.0] + 0.15 * tracks.points())
     now = se3.transform(se3.inverse(MOVED), before + on_person[:, None] * [0.02, 0.0, 0.0])
-    distance = np.linalg.norm(before, axis=1)
-    tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
-    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (len(now), 2))
-    tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.2, (len(now), 2))
+    put(rng, tracks, before, now)
     tracks.age[:], tracks.mapped[:] = 60, True
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
@@ -192,16 +191,11 @@ def before_one_wall(rng: np.random.Generator, age: int = 1) -> tuple[Tracks, Boo
     now = se3.transform(se3.inverse(MOVED), before)
     on_person = np.arange(len(before)) >= len(store)
     now[on_person, 0] += 0.008
-    distance = np.linalg.norm(before, axis=1)
-    assert RIG.right is not None
     tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < len(before))
-    tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
-    tracks.variance = np.square(0.002 / distance)
+    put(rng, tracks, before, now, 0.25)
+    tracks.variance = np.square(0.002 * tracks.rho)
     young = on_person | (np.arange(len(before)) < 40)
     tracks.age, tracks.mapped = np.where(young, age, 20).astype(np.int32), ~young
-    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.25, (len(now), 2))
-    right = RIG.project_right(now)
-    tracks.uv_right = right + rng.normal(0, 0.25, (len(now), 2))
     return tracks, on_person
 
 
@@ -268,13 +262,9 @@ def few_points(rng: np.random.Generator, moved: F64) -> Tracks:
     """14 distant points in a part of the view; the first of four near ones is found 60 px from where it is."""
     before = rng.uniform([-4.0, -1.0, 5.0], [-2.0, 0.5, 8.0], (18, 3))
     before[14:] = rng.uniform([0.0, -0.1, 0.6], [0.3, 0.2, 0.9], (4, 3))
-    now, distance = se3.transform(se3.inverse(moved), before), np.linalg.norm(before, axis=1)
-    assert RIG.right is not None
     tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < 18)
-    tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
-    tracks.variance, tracks.age = np.square(0.01 / distance), np.ones(18, np.int32)
-    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (18, 2))
-    tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.2, (18, 2))
+    put(rng, tracks, before, se3.transform(se3.inverse(moved), before))
+    tracks.variance, tracks.age = np.square(0.01 * tracks.rho), np.ones(18, np.int32)
     tracks.uv_right[14:] = np.nan
     tracks.uv[14] += 60.0 * se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, rng.uniform(0.0, 6.3)]))[:2, 0]
     return tracks
@@ -556,13 +546,11 @@ def test_a_new_point_on_somebody_near_does_not_take_a_known_pose_along() -> None
         rng = np.random.default_rng(seed)
         before = rng.uniform([-1.2, -0.9, 2.4], [1.2, 0.9, 3.0], (61, 3))
         before[-1] = [-0.3, -0.2, 0.7]
-        now, distance = se3.transform(se3.inverse(MOVED), before), np.linalg.norm(before, axis=1)
+        now = se3.transform(se3.inverse(MOVED), before)
         now[-1, 0] += 0.008
         tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < 61)
-        tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
-        tracks.variance, tracks.age = np.square(0.005 / distance), np.where(distance < 1, 1, 20).astype(np.int32)
-        tracks.uv = RIG.left.project(now) + rng.normal(0, 0.25, (61, 2))
-        tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.25, (61, 2))
+        put(rng, tracks, before, now, 0.25)
+        tracks.variance, tracks.age = np.square(0.005 * tracks.rho), np.where(tracks.rho > 1, 1, 20).astype(np.int32)
         solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
         expected = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
         all_points = solver._optimise(tracks, expected, np.ones(61, bool))  # pyright: ignore[reportPrivateUsage]

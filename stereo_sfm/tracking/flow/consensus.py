@@ -2,12 +2,13 @@
 
 While most points agree, all have the same weight. When a group of neighbouring points disagrees, or many points are
 lost, a second motion is estimated from the points that disagree. The camera's motion is the one that is supported by
-the points tracked longest, among those that are plausible after its recent motion. Points that support another motion,
-or that disagree repeatedly as a group, are marked as moving. They are tracked further, so that no new points are added
-on a moving object, but they do not contribute to the pose until they have been static for a second: somebody who sways
-stands still for a moment, too. A mark is evidence that moves both ways: agreement takes from it, disagreement adds to
-it. New points beside marked ones that disagreed themselves start with as much as these have, never with more: marks in
-a still room fade, and do not spread with the view of a camera that turns.
+the points tracked longest, among those that are plausible after its recent motion; until points have been tracked for
+long, the motion of the farther half is one of them. Points that support another motion, or that disagree repeatedly as
+a group, are marked as moving. They are tracked further, so that no new points are added on a moving object, but they do
+not contribute to the pose until they have been static for a second: somebody who sways stands still for a moment, too.
+A mark is evidence that moves both ways: agreement takes from it, disagreement adds to it. New points beside marked ones
+that disagreed themselves start with as much as these have, never with more: marks in a still room fade, and do not
+spread with the view of a camera that turns.
 """
 
 from __future__ import annotations

@@ -265,12 +265,12 @@ class FramePoseSolver:
         static = ~tracks.moving
         other = self._solve_rest(tracks, expected, last_pose, rest)
         agreed = None if best.reason else self._refit(tracks, expected, best, best.inlier & static, static)
-        known = tracks.age * expected.seconds >= SURE_S
-        if np.count_nonzero(static & known) < self._config.min_features:  # who walks hides what is farther
-            known = tracks.rho < median(tracks.rho[static])
+        surest = tracks.age * expected.seconds >= SURE_S
+        if np.count_nonzero(static & surest) < self._config.min_features:  # who walks hides what is farther
+            surest = tracks.rho < median(tracks.rho[static])
         near = self._errors(tracks, expected.pose, expected.velocity) < 2.0 * self._config.max_error_sigmas
-        by_known, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (known, near))
-        found = [agreed, by_known, other, by_near]
+        by_surest, by_near = (self._solve_by(tracks, expected, static & part, static) for part in (surest, near))
+        found = [agreed, by_surest, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
         if not self.alert and agreed is not None and not self._plausible(agreed.pose, expected):
             # Points that agree with the best pose, too, are no evidence of another: the prediction is wrong.
@@ -316,8 +316,8 @@ class FramePoseSolver:
     def _solve_by(self, tracks: Tracks, expected: ExpectedMotion, by: Bool, static: Bool) -> PoseSolution | None:
         """Solve with a part of the static points, `by` (N,), then with all their inliers; None with too few.
 
-        With those that have been static for long, while none has with the farther half, or with those that are about
-        where the predicted motion takes them.
+        Called with those that are least likely to move: static for long, or farther than the median while too few have
+        been; and with those that are about where the predicted motion takes them.
         """
         if by.sum() < self._config.min_features or by[static].all():
             return None
