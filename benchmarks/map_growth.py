@@ -40,6 +40,7 @@ from _aisle import Aisle, SimulatedTracker, round_and_round, there_and_back
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper, run_job
 from stereo_sfm.timing import Spans
@@ -83,9 +84,9 @@ def insert(map_: Map, kf: Keyframe) -> None:
     new = map_.point_rows(kf.point_ids) < 0
     map_.add_points(kf.point_ids[new], kf.points_cam[new], row)
     map_.observe(row, map_.point_rows(kf.point_ids), kf.uv_left, kf.uv_right, kf.descriptors)
-    neighbours, _ = map_.neighbours(row, 15)
+    neighbours = map_.neighbours(row, 15)
     if len(neighbours):
-        map_.observations_of_points(map_.observations.pt[map_.observations_of_keyframe(int(neighbours[0]))])
+        map_.sightings(map_.seen_by(int(neighbours[0])))
     map_.take_delta()
 
 
@@ -143,7 +144,7 @@ class Drive:
         self._poses, self._lag = poses, config.pipeline.loop_lag_keyframes
         self._spans = ProcessorSpans()
         self.mapper = Mapper(config.mapper, rig, self._spans, config.loop)
-        self.closer = LoopCloser(config.loop, rig, spans=self._spans)
+        self.closer = LoopCloser(config.loop, rig, default_vocabulary(), self._spans)
         self._tracker = SimulatedTracker(Aisle(), rig)
         self._loops: deque[LoopResult] = deque()
         self.ms: list[dict[str, float]] = []

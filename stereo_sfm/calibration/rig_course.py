@@ -29,20 +29,11 @@ RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (rat
 
 
 @dataclass(frozen=True, eq=False)
-class Scatter:
-    """What is known of the windows' own errors."""
-
-    covariance: F64  # (8, 8)
-    windows: float = PRIOR_WINDOWS  # as many windows as have shown it
-
-
-@dataclass(frozen=True, eq=False)
 class Course:
     """Columns times coefficients are the terms; each window has an own error besides."""
 
     value: F64  # (K, 8) coefficients
     covariance: F64  # (8 K, 8 K)
-    scatter: Scatter  # of the windows
     freedom: float  # degrees of freedom of the covariance's scale
 
     def at(self, column: Sequence[float]) -> Estimate:
@@ -56,16 +47,16 @@ class Course:
         gain = np.linalg.solve(self.covariance[at][:, at], self.covariance[at]).T
         value = self.value.ravel() - gain @ self.value.ravel()[at]
         covariance = self.covariance - gain @ self.covariance[at] + 1e-20 * np.eye(len(value))
-        return Course(value.reshape(-1, RIG_TERMS), covariance, self.scatter, self.freedom)
+        return Course(value.reshape(-1, RIG_TERMS), covariance, self.freedom)
 
 
-def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: Scatter) -> Course:
+def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: F64) -> Course:
     """The course of the terms over windows.
 
     Args:
         windows: one at least. columns: (N, K) of them, to which their turns are added here.
         prior: (K, 8) standard deviations of the coefficients around zero.
-        expected: before these windows show it.
+        expected: (8, 8) covariance of the windows' own errors before these show it.
     """
     count, kinds = columns.shape
     columns = np.concatenate([columns, [w.turn for w in windows]], axis=1)
@@ -73,7 +64,7 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: Sca
     matrices = np.stack([w.information.matrix for w in windows])
     vectors = np.stack([w.information.vector for w in windows])
     axes = np.einsum("nk,ab->nakb", columns, np.eye(RIG_TERMS)).reshape(count, RIG_TERMS, -1)
-    scatter, known = expected.covariance, expected.windows
+    scatter, freedom = expected, PRIOR_WINDOWS + count
     value, covariance, error = np.zeros(axes.shape[-1]), precision, np.zeros((count, RIG_TERMS))
     for _ in range(ITERATIONS):
         own = np.linalg.inv(matrices + np.linalg.inv(scatter))  # covariance of a window's own error
@@ -84,13 +75,12 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: Sca
         error = (own @ (vectors - (matrices @ (axes @ value)[..., None])[..., 0])[..., None])[..., 0]
         moved = own @ matrices @ axes  # own errors by the coefficients
         squares = np.einsum("na,nb->ab", error, error) + (own + moved @ covariance @ moved.transpose(0, 2, 1)).sum(0)
-        scatter = (known * expected.covariance + squares) / (known + count)
+        scatter = (PRIOR_WINDOWS * expected + squares) / freedom
     alike = _alike(error, scatter)
     size = kinds * RIG_TERMS
     grown = 1 + 2 * alike / (1 - alike) * (1 - 1 / count)  # of a mean of alike errors
-    shown = Scatter(scatter, known + count)
     values, covariance = np.asarray(value[:size], float).reshape(kinds, RIG_TERMS), np.asarray(covariance, float)
-    return Course(values, grown * covariance[:size, :size], shown, known + count - kinds)
+    return Course(values, grown * covariance[:size, :size], freedom - kinds)
 
 
 def _alike(error: F64, scatter: F64) -> float:
@@ -104,12 +94,12 @@ def _alike(error: F64, scatter: F64) -> float:
     return float(np.clip((PRIOR_WINDOWS * ALIKE + count * shown) / (PRIOR_WINDOWS + count), 0.0, MOST_ALIKE))
 
 
-def constant(windows: Sequence[RigWindow], expected: Scatter) -> Course:
+def constant(windows: Sequence[RigWindow], expected: F64) -> Course:
     """One column: a rig that does not change."""
     return course(windows, np.ones((len(windows), 1)), PRIOR[None], expected)
 
 
-def steady(windows: Sequence[RigWindow], span: Sequence[RigWindow], expected: Scatter) -> Course:
+def steady(windows: Sequence[RigWindow], span: Sequence[RigWindow], expected: F64) -> Course:
     """Two columns: the terms at the end of `span`, and their change over it."""
     end_ns, seconds = span[-1].stamp_ns, (span[-1].stamp_ns - span[0].stamp_ns) * 1e-9
     columns = np.array([[1.0, (w.stamp_ns - end_ns) * 1e-9 / seconds] for w in windows])

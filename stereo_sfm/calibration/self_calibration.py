@@ -24,19 +24,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, SIGMAS, UNITS, Choice, Estimate, choose, significant
+from stereo_sfm.calib.choice import NAMES, SCALES, SIGMAS, UNITS, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calibration.rig_course import Scatter, constant, steady
+from stereo_sfm.calibration.rig_course import constant, steady
 from stereo_sfm.calibration.rig_window import LENSES, RigWindow, SeenPoints, solve_window
 from stereo_sfm.config import Config
 from stereo_sfm.types import F64, RIG_TERMS, Bool, CalibrationUpdate, Keyframe
 
-OF_ROTATION = np.arange(RIG_TERMS) < 3  # of the right camera
 KEYFRAMES = 4  # of one window, the last one may have one less; a rotation that the tracker noticed stays for as many
 # Share of the image's width that common points move (median) between keyframes of a window: less says little.
 MIN_MOTION = 0.02
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case: near ones left the view
-MIN_WINDOWS = 2  # before the first correction: one for each half
 # Windows that each term needs, in the order in which cameras err: rotation, baseline and focal length, decentering.
 INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
 # For halves of two windows each, twice as many for drift, of which two are unknown. As many as there are, but no more
@@ -89,7 +87,7 @@ class SelfCalibration:
         self._since = 0  # first keyframe of the windows
         self._stamp_ns = 0  # newest keyframe
         self._revised_ns = 0  # newest keyframe of the last revision
-        self._until_due = MIN_WINDOWS  # windows until the next revision
+        self._until_due = 2  # windows until the next revision, before the first one for each half
         self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
         self._turn: F64 = np.zeros(3)  # that the tracker noticed
         self._turned_kf_id = -1  # first keyframe since; -1: the rig has been corrected
@@ -97,7 +95,7 @@ class SelfCalibration:
         turn, roll = 1 / rig.left.fx, 2 / half_width
         decentering = roll * rig.left.fx / half_width
         self._of_pixel = np.array([turn, turn, roll, np.inf, np.inf, roll, decentering, decentering])
-        self._expected = Scatter(np.diag(np.minimum(WINDOW_PX * self._of_pixel, DIRECTION) ** 2))
+        self._expected = np.diag(np.minimum(WINDOW_PX * self._of_pixel, DIRECTION) ** 2)
         self._taken_back = np.zeros(RIG_TERMS, bool)
         self._sigma = np.zeros(RIG_TERMS)  # of the corrections, those of the basis
 
@@ -133,22 +131,18 @@ class SelfCalibration:
         """After the last keyframe: a last revision from all windows."""
         if len(self._keyframes) >= KEYFRAMES - 1:
             self._close_window()
-        return self._revise(refined_sigmas=0.0) if len(self.windows) >= MIN_WINDOWS else None
+        return self._revise(refined_sigmas=0.0) if len(self.windows) >= 2 else None
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
         return self._beyond(self.terms, constant(windows, self._expected).at([1.0]))
 
-    @property
-    def _floor(self) -> F64:
-        """(8,) standard deviations of what all windows share."""
-        px = np.full(RIG_TERMS, MATCHING_PX)
-        px[LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
-        return np.minimum(px * self._of_pixel, DIRECTION)
-
     def _beyond(self, terms: F64, found: Estimate) -> Estimate:
         """The change from `terms`, with errors that all windows share."""
-        return Estimate(found.value - terms, found.covariance + np.diag(self._floor**2), found.freedom)
+        px = np.full(RIG_TERMS, MATCHING_PX)
+        px[LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
+        shared = np.minimum(px * self._of_pixel, DIRECTION)
+        return Estimate(found.value - terms, found.covariance + np.diag(shared**2), found.freedom)
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -220,9 +214,10 @@ class SelfCalibration:
         wrong = drift.terms if drift and not self._corrected.any() else self._corrected.any()
         new = np.where(ignored, np.inf, np.where(wrong, FURTHER_SIGMAS, SIGMAS))
         sigmas, back = np.where(self._corrected, refined_sigmas, new), kept - self.terms
-        choice = self._choose(whole, parts, sigmas)
+        choice = choose(whole, parts, self._rolling, sigmas, self._corrected)
         if not (drift or self._helps(halves, [p.without(choice.selected).value for p in parts], basis, back)):
-            choice = self._choose(whole, parts, np.where(self._corrected, refined_sigmas, np.inf))
+            further = np.where(self._corrected, refined_sigmas, np.inf)
+            choice = choose(whole, parts, self._rolling, further, self._corrected)
         hunting = self._corrected & (np.abs(choice.value) > HUNTING_SIGMAS * self._sigma)
         hunting &= np.abs(choice.value + basis @ kept) < SIGMAS * choice.sigma
         if hunting.any() and not drift:
@@ -231,9 +226,6 @@ class SelfCalibration:
         value = np.asarray(np.linalg.solve(basis, choice.value), float) + back
         covariance = whole.by(np.asarray(np.linalg.inv(basis), float)).covariance
         return _Change(value, choice.sigma, covariance, choice.selected) if value.any() else None
-
-    def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
-        return choose(whole, parts, self._rolling, sigmas, self._corrected)
 
     def _helps(self, halves: Sequence[Sequence[RigWindow]], values: Sequence[F64], basis: F64, back: F64) -> bool:
         """Whether what one half says makes rows and reprojections of the other half's windows better.
@@ -259,7 +251,7 @@ class SelfCalibration:
         if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + KEYFRAMES - 1:
             return None
         change, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
-        change[OF_ROTATION] = self._turn
+        change[:3] = self._turn
         covariance[:3, :3] = keyframe.right_turn_covariance
         sigma = np.sqrt(np.diag(covariance))
         self.windows = deque((w.turned(change) for w in self.windows), maxlen=MAX_WINDOWS)

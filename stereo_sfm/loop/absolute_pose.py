@@ -40,11 +40,6 @@ class Matches(NamedTuple):
     uv_left_a: F64  # (N, 2) px
     uv_right_a: F64  # (N, 2) px
 
-    @property
-    def size(self) -> int:
-        """N."""
-        return len(self.points_a)
-
 
 def joined(parts: Sequence[Matches]) -> Matches:
     """All matches of several lists."""
@@ -62,9 +57,9 @@ class Pose:
 
 def ransac_pose(matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float) -> F64 | None:
     """b_T_a (4, 4) with the smallest truncated error among the poses of many threes, None if no three give a pose."""
-    if matches.size < 4:
+    if len(matches.points_a) < 4:
         return None
-    rows = rng.integers(0, matches.size, (SAMPLES, 3))
+    rows = rng.integers(0, len(matches.points_a), (SAMPLES, 3))
     points, rays = matches.points_a[rows], rig.left.unproject(matches.uv_left_b)[rows]
     measured = np.linalg.norm(matches.points_b, axis=1)[rows]
     known = np.isfinite(measured)

@@ -87,13 +87,7 @@ class LoopCloser:
     with strong evidence is enough, if the motion that it implies is possible.
     """
 
-    def __init__(
-        self, config: LoopConfig, rig: Rig, vocabulary: Vocabulary | None = None, spans: NoSpans | None = None
-    ) -> None:
-        if vocabulary is None:
-            from stereo_sfm.loop.vocabulary_file import configured_vocabulary
-
-            vocabulary = configured_vocabulary(config)
+    def __init__(self, config: LoopConfig, rig: Rig, vocabulary: Vocabulary, spans: NoSpans | None = None) -> None:
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._side_config = of_a_part(config, config.side_inliers)
         self._chance = config.relocalize_share  # of corners that agree where a place only looks alike
@@ -112,7 +106,7 @@ class LoopCloser:
         # newest keyframes with corners
         self._described: deque[int] = deque(maxlen=max(GAP_WINDOW, config.consistent_window))
         self._repeated = 0  # keyframes added to views of earlier visits, less those removed there
-        self._last_loop = -(10**9)
+        self._last_loop = -1
         self._sees_sides = False  # some keyframe had views that face shelves
 
     def step(self, keyframe: Keyframe, own: Rig | None = None) -> LoopResult:

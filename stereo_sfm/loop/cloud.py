@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words, hamming
 from stereo_sfm.geometry.kernels import njit
@@ -18,8 +19,7 @@ from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, Keyframe
 
-# Largest differences of one corner in two keyframes: of positions by stereo, of descriptors (as of points of the map).
-SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50
+SAME_CORNER_PX = 4.0  # largest difference of one corner in two keyframes, of positions by stereo
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a place's own: on both sides of it
 
 
@@ -32,9 +32,6 @@ class Cloud(PlaceView):
 
     view: I64  # (M,) the row's own keyframe: row of centre_T_kf
     centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
     def seen_by_centre(self, rows: I64) -> tuple[F64, F64]:
         """Left and right pixels (N, 2) of these rows in the centre's image, NaN for views of other keyframes."""
@@ -85,7 +82,7 @@ def _name_corners(views: Sequence[PlaceView], cloud: Cloud, rig: Rig) -> I64:
             uv = rig.left.project(se3.transform(se3.inverse(cloud.centre_T_kf[k]), points[:before]))
             best = _nearest_within(
                 view.uv_left[:count], as_words(view.descriptors[:count]), view.corner[:count],
-                uv, words[:before], kinds[:before], SAME_CORNER_PX, SAME_CORNER_BITS,
+                uv, words[:before], kinds[:before], SAME_CORNER_PX, MapperConfig.match_distance_bits,
             )  # fmt: skip
             matched = np.flatnonzero(best >= 0)
             known, first = np.unique(ids[best[matched]], return_index=True)

@@ -79,7 +79,7 @@ class RecentPlaces:
         if start is None:
             return None
         pose = refine_pose(start, matches, rig, sigma_px)
-        enough = pose.inlier.sum() >= max(MIN_INLIERS, 0.5 * matches.size)
+        enough = pose.inlier.sum() >= max(MIN_INLIERS, 0.5 * len(matches.points_a))
         return pose.b_T_a if enough else None
 
     def _order(self, expected: F64) -> list[Keyframe]:

@@ -78,9 +78,6 @@ class IdRows:
         self.ids: I64 = np.zeros(0, np.int64)  # ascending
         self.rows: I32 = np.zeros(0, np.int32)  # of each of them; may be written to
 
-    def __len__(self) -> int:
-        return len(self.ids)
-
     def find(self, ids: I64) -> I64:
         """(N,) row of each id, -1 for an unknown one."""
         if not len(self.ids):

@@ -25,7 +25,8 @@ from stereo_sfm.mapping.side_points import join_corners
 from stereo_sfm.tracking.flow.motion_prior import DRIFT
 from stereo_sfm.types import F64, I64, LoopResult
 
-COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph: as many as a loop must have
+# Shared points of keyframes that get an edge in the pose graph: as many as a loop must have.
+COVISIBLE_POINTS = LoopConfig.min_inliers
 # Standard deviation of an odometry edge, metres and radians per metre, of good tracking; DRIFT is its systematic part.
 ODOMETRY = 0.004, 0.0006
 MAX_STRAIN = 6.0  # sigmas^2 that a loop may keep: chi-squared of six degrees of freedom has this mean
@@ -90,7 +91,7 @@ def loop_is_known(map_: Map, loop: LoopResult) -> bool:
 def sides_share_points(map_: Map, loop: LoopResult, connected_points: int) -> bool:
     """Whether some keyframe that shares points with one end of a loop shares some with the other."""
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    around_a, around_b = (map_.neighbours(row, connected_points)[0] for row in (a, b))
+    around_a, around_b = (map_.neighbours(row, connected_points) for row in (a, b))
     return len(np.intersect1d(np.append(around_a, a), around_b)) > 0
 
 
@@ -208,7 +209,7 @@ def odometry_edges(map_: Map, poses: F64) -> Edges:
         previous = int(map_.keyframes.previous[row])
         if previous >= 0 and alive[previous]:
             pairs.add((previous, row))
-        for other in map_.neighbours(row, COVISIBLE_POINTS)[0].tolist():
+        for other in map_.neighbours(row, COVISIBLE_POINTS).tolist():
             if alive[other] and (doubt[other] == doubt[row]).all():  # else the points err as the odometry does
                 pairs.add((min(row, other), max(row, other)))
     table = np.array(sorted(pairs), np.int64).reshape(-1, 2)

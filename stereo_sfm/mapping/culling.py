@@ -54,7 +54,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
     """
     if config.redundant_share > 1:
         return -1
-    neighbours, _ = map_.neighbours(newest, config.connected_points)
+    neighbours = map_.neighbours(newest, config.connected_points)
     neighbours = np.sort(neighbours[~protected[neighbours]])
     shares = _seen_by_others(map_, neighbours)
     for row in neighbours[shares > config.redundant_share].tolist():
@@ -80,7 +80,7 @@ def _alone_described(map_: Map, row: int, config: MapperConfig) -> bool:
     """
     if not len(map_.corners[row][0]):
         return False
-    others, _ = map_.neighbours(row, config.connected_points)
+    others = map_.neighbours(row, config.connected_points)
     others = others[others < row]
     return not _described(map_, others[_same_view(map_, row, others)]).any()
 

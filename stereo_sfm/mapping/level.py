@@ -69,12 +69,6 @@ def weights(sigma: F64) -> F64:
     return np.where(sigma > 0, 1.0 / np.square(np.where(sigma > 0, sigma, 1.0)), 0.0)
 
 
-def down_of(map_: Map, rows: I64) -> F64:
-    """(3,) direction of gravity in the map as keyframes measured it: a unit vector, or zero where none did."""
-    table = map_.keyframes
-    return mean_down(table.map_T_kf[rows], table.down[rows], table.down_sigma[rows])
-
-
 def mean_down(map_T_kf: F64, down: F64, sigma: F64) -> F64:
     """(3,) direction of gravity in the map: a unit vector, or zero where no keyframe measured it.
 

@@ -10,8 +10,6 @@ of corners belong to no track: the tracker never hears of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
@@ -22,19 +20,6 @@ from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F64, I64, U8, Corners, Keyframe
-
-
-@dataclass(frozen=True, eq=False)
-class MapDelta:
-    """Changes since the last delta, as copies."""
-
-    kf_rows: I64  # (K,) new or moved living keyframes, ascending
-    map_T_kf: F64  # (K, 4, 4)
-    culled_kf: I64  # (R, 2) rows: a culled keyframe, its reference keyframe
-    reference_T_kf: F64  # (R, 4, 4) its pose relative to the reference keyframe
-    pt_rows: I64  # (P,) new or moved living points that have tracks, ascending
-    xyz: F64  # (P, 3)
-
 
 POSE_POINTS = 10  # known points from which a keyframe's pose is solved, three times the least that determine one
 
@@ -99,17 +84,16 @@ class Map:
             seen[self.seen_by(row)] = True
         return np.flatnonzero(seen)
 
-    def count_by_keyframe(self, points: I64) -> I64:
-        """(K,) number of the points that each keyframe observes."""
-        return np.bincount(self.observations.kf[self.sightings(points)[0]], minlength=len(self.keyframes))
-
-    def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
-        """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, then oldest first."""
-        counts = self.count_by_keyframe(self.seen_by(row))
-        counts[row] = 0
+    def seeing(self, points: I64, at_least: int = 1) -> I64:
+        """Rows of the keyframes that observe so many of the points: most of them first, then oldest first."""
+        counts = np.bincount(self.observations.kf[self.sightings(points)[0]])
         rows = np.flatnonzero(counts >= max(at_least, 1))
-        rows = rows[np.argsort(-counts[rows], kind="stable")]
-        return rows, counts[rows]
+        return rows[np.argsort(-counts[rows], kind="stable")]
+
+    def neighbours(self, row: int, at_least: int = 1) -> I64:
+        """Rows of the keyframes that share so many points with one, in the order of `seeing`."""
+        rows = self.seeing(self.seen_by(row), at_least)
+        return rows[rows != row]
 
     def sightings(self, points: I64) -> tuple[I64, I64]:
         """Rows of all observations of points (P,), point after point, newest first, and which of the points each is."""
@@ -118,10 +102,6 @@ class Map:
         rows = np.empty(int(counts.sum()), np.int64)
         map_kernels.list_observations(points, self.points.head, self.observations.following, rows)
         return rows, np.repeat(np.arange(len(points)), counts)
-
-    def observations_of_points(self, rows: I64) -> I64:
-        """Rows of all observations of some points, ascending."""
-        return np.sort(self.sightings(rows)[0])
 
     def descriptors_of(self, rows: I64) -> U8:
         """(N, 32) descriptor of each point, zero where it has none."""
@@ -174,7 +154,7 @@ class Map:
         return rows
 
     def add_untracked(self, xyz: F64, anchor: int, sigma: float) -> int:
-        """Add a point (3,) that no track belongs to, see `MapDelta`. Returns its row."""
+        """Add a point (3,) that no track belongs to, see `take_delta`. Returns its row."""
         return self.points.append(1, xyz=xyz, anchor=anchor, last_seen=anchor, sigma=sigma).start
 
     def observe(self, kf: int, pt_rows: I64, uv_left: F64, uv_right: F64, descriptors: U8) -> I64:
@@ -280,7 +260,7 @@ class Map:
     def cull_points(self, rows: I64) -> None:
         """Cull points with all their observations."""
         rows = rows[self.points.alive[rows]]
-        self.remove_observations(self.observations_of_points(rows))
+        self.remove_observations(self.sightings(rows)[0])
         self.points.alive[rows] = False
 
     def cull_keyframe(self, row: int) -> None:
@@ -314,7 +294,7 @@ class Map:
 
     def _carry(self, row: int) -> None:
         """Make another keyframe the reference of a keyframe, and of those whose reference it was."""
-        others, _ = self.neighbours(row)
+        others = self.neighbours(row)
         reference = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
         table = self.keyframes
         reference_T_row = se3.inverse(table.map_T_kf[reference]) @ table.map_T_kf[row]
@@ -352,7 +332,7 @@ class Map:
 
     def _seen_with(self, point: int, other: int) -> I64:
         """Rows of the observations of one point by keyframes that see the other, too."""
-        obs, others = (self.observations_of_points(np.array([p])) for p in (point, other))
+        obs, others = (self.sightings(np.array([p]))[0] for p in (point, other))
         return obs[np.isin(self.observations.kf[obs], self.observations.kf[others])]
 
     # -- memory ------------------------------------------------------------------------------------------------------
@@ -439,18 +419,21 @@ class Map:
 
     # -- copies ------------------------------------------------------------------------------------------------------
 
-    def take_delta(self) -> MapDelta:
-        """Changes since the last call."""
+    def take_delta(self) -> tuple[I64, I64, I64]:
+        """Rows of what has changed since the last call.
+
+        Returns:
+            New or moved living keyframes (K,), culled keyframes (R,), new or moved living points that have tracks (P,).
+        """
         kf = np.array(sorted(self._changed_kf), np.int64)
         kf = kf[self.keyframes.alive[kf]]
         gone = np.array(self._culled_kf, np.int64)
-        culled = np.stack([gone, self.keyframes.reference[gone]], 1), self.keyframes.reference_T_kf[gone]
         pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
         pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0]) & (self.points.pt_id[pt] >= 0)]
         self._changed_kf.clear()
         self._changed_pt.clear()
         self._culled_kf.clear()
-        return MapDelta(kf, self.keyframes.map_T_kf[kf], *culled, pt, self.points.xyz[pt])
+        return kf, gone, pt
 
     def snapshot(self) -> MapSnapshot:
         """Copy of the living keyframes, points and observations."""

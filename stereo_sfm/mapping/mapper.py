@@ -50,7 +50,7 @@ from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known, sides_share_points
 from stereo_sfm.mapping.insertion import insert_keyframe
-from stereo_sfm.mapping.level import down_of
+from stereo_sfm.mapping.level import mean_down
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.mapping.recalibration import recalibrate
@@ -203,8 +203,8 @@ class Mapper(AnyMapper):
         return self._update(int(self.map.keyframes.kf_id[-1]))
 
     def _update(self, kf_id: int) -> MapUpdate:
-        delta, table = self.map.take_delta(), self.map.keyframes
-        of_first_submap = np.flatnonzero(table.alive & (table.submap_id == table.submap_id[0]))
+        (kf, gone, pt), table = self.map.take_delta(), self.map.keyframes
+        first = np.flatnonzero(table.alive & (table.submap_id == table.submap_id[0]))  # whose frame is the map's
         culled = self.map.points.pt_id[np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))]
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
         refused = np.array(self._refused, np.int64)
@@ -214,21 +214,21 @@ class Mapper(AnyMapper):
         return MapUpdate(
             version=self._version,
             kf_id=kf_id,
-            kf_ids=table.kf_id[delta.kf_rows],
-            map_T_kf=delta.map_T_kf,
-            point_ids=self.map.points.pt_id[delta.pt_rows],
-            points_map=delta.xyz,
+            kf_ids=table.kf_id[kf],
+            map_T_kf=table.map_T_kf[kf],
+            point_ids=self.map.points.pt_id[pt],
+            points_map=self.map.points.xyz[pt],
             culled_point_ids=culled[culled >= 0],
             fused_point_ids=fused[(fused >= 0).all(axis=1)],
             map_T_odom=self._map_T_odom.copy(),
-            culled_kf_ids=table.kf_id[delta.culled_kf[:, 0]],
-            carrier_kf_ids=table.kf_id[delta.culled_kf[:, 1]],
-            carrier_T_kf=delta.reference_T_kf,
+            culled_kf_ids=table.kf_id[gone],
+            carrier_kf_ids=table.kf_id[table.reference[gone]],
+            carrier_T_kf=table.reference_T_kf[gone],
             refused_kf_ids=refused,
             calibration=revised,
             row_errors=row_errors,
             sensors=self._sensor_update,
-            down=down_of(self.map, of_first_submap),  # whose frame is the map's
+            down=mean_down(table.map_T_kf[first], table.down[first], table.down_sigma[first]),
         )
 
     # -- calibration -------------------------------------------------------------------------------------------------

@@ -34,10 +34,9 @@ def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:
         map_.corners[row] = _placed(seen[0], before, after), _placed(seen[1], before, after)
     rows = map_.living_points()
     rows = rows[map_.points.obs_count[rows] > 0]
-    old = map_.points.xyz[rows].copy()
     new = triangulate(map_, after, rows)
     good = np.asarray(np.isfinite(new).all(1))
-    map_.move_points(rows[good], np.where(good[:, None], new, old)[good])
+    map_.move_points(rows[good], new[good])
 
 
 def _placed(corners: Corners, before: Rig, after: Rig) -> Corners:

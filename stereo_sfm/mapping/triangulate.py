@@ -156,11 +156,9 @@ def triangulate(map_: Map, rig: Rig, rows: I64) -> F64:
     """(N, 3) better positions of some points from all their observations; each must have at least one."""
     table, keyframes = map_.observations, map_.keyframes
     rows = np.asarray(rows, np.int64)
-    obs = map_.observations_of_points(rows)
-    order = np.argsort(rows, kind="stable")
-    index = order[np.searchsorted(rows[order], table.pt[obs])]
-    obs = obs[np.argsort(index, kind="stable")]
-    starts = np.searchsorted(np.sort(index), np.arange(len(rows) + 1))
+    obs, of = map_.sightings(rows)
+    obs = obs[np.lexsort((obs, of))]  # point after point, oldest first
+    starts = np.searchsorted(of, np.arange(len(rows) + 1))
     oldest = obs[starts[:-1]]
     pose = keyframes.map_T_kf[table.kf[oldest]]
     bearing = rig.left.unproject(table.uv_left[oldest].astype(float))

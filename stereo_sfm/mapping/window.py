@@ -26,7 +26,6 @@ class Window:
 
     bundle: Bundle
     kf_rows: I64  # (K,) keyframe rows, the moving ones first
-    moving: int  # number of moving ones
     pt_rows: I64  # (P,)
     obs_rows: I64  # (M,)
 
@@ -62,9 +61,9 @@ def covisible_window(map_: Map, row: int, config: MapperConfig, imu: Imu | None 
     The map's first keyframe is fixed, and so is the oldest keyframe of a part that no fixed keyframe is connected to.
     The bundle has what the map knows of the motions between the keyframes (`motions.Motion`).
     """
-    others, _ = map_.neighbours(row, config.connected_points)
+    others = map_.neighbours(row, config.connected_points)
     if not len(others):
-        others, _ = map_.neighbours(row)
+        others = map_.neighbours(row)
     part = _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
     return _with_motions(part, map_, imu)
 
@@ -94,10 +93,8 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     pts = map_.points_of_keyframes(moving)
     pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
     obs, obs_pt = map_.sightings(pts)
-    counts = np.bincount(table.kf[obs], minlength=len(map_.keyframes))
-    counts[moving] = 0
-    seeing = np.flatnonzero(counts)
-    held = np.sort(seeing[np.argsort(-counts[seeing], kind="stable")][:most_fixed])
+    seeing = map_.seeing(pts)
+    held = np.sort(seeing[~np.isin(seeing, moving)][:most_fixed])
     kfs = np.concatenate([np.sort(moving), held])
     fixed = np.arange(len(kfs)) >= len(moving)
     fixed |= kfs == 0
@@ -111,7 +108,7 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
         map_.keyframes.map_T_kf[kfs], fixed, points.xyz[pts], kf_index[table.kf[obs]], obs_pt, uv_left, uv_right,
         np.repeat(sigma[:, None], 2, 1), level_of(map_, kfs, fixed),
     )  # fmt: skip
-    return Window(bundle, kfs, len(moving), pts, obs)
+    return Window(bundle, kfs, pts, obs)
 
 
 def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
@@ -125,7 +122,7 @@ def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
     for first in np.flatnonzero(~fixed)[::-1].tolist():
         part, ends, loose = {first}, [first], not held[first]
         while loose and ends:
-            linked = index[map_.neighbours(int(kfs[ends.pop()]), POSE_POINTS)[0]]
+            linked = index[map_.neighbours(int(kfs[ends.pop()]), POSE_POINTS)]
             linked = linked[linked >= 0]
             loose = not held[linked].any()
             ends += [i for i in linked.tolist() if i not in part]

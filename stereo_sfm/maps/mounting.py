@@ -29,18 +29,12 @@ ROUNDS = 10  # of weights and direction, which depend on each other
 
 @dataclass(frozen=True, eq=False)
 class Mounting:
-    """The vertical as the camera sees it.
+    """The vertical as the camera sees it."""
 
-    Attributes:
-        up: (3,) unit vector in the left camera's axes.
-        pitch_deg, roll_deg: how far the camera looks down, and its right side hangs down.
-        pitch_sigma_deg, roll_sigma_deg: their standard deviations.
-    """
-
-    up: F64
-    pitch_deg: float
-    roll_deg: float
-    pitch_sigma_deg: float
+    up: F64  # (3,) unit vector in the left camera's axes
+    pitch_deg: float  # by which the camera looks down
+    roll_deg: float  # by which its right side hangs down
+    pitch_sigma_deg: float  # standard deviation
     roll_sigma_deg: float
 
     @property

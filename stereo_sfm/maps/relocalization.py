@@ -88,8 +88,7 @@ class Relocalizer:
         """Args:
         rig: of the camera. map_rigs: of each keyframe of the map, the same object for equal ones; none: the camera's.
         """
-        self.map, self._own, self.camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
-        self._rig = widest([rig, *dict.fromkeys(self._own)])  # whose pixels are compared
+        self.map, self._own = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids)
         self._keyframes = snapshot.keyframes()
         self._described = np.array([k.described for k in self._keyframes], bool)
         self._near_share = config.min_inlier_share
@@ -102,6 +101,7 @@ class Relocalizer:
         self._sees = self._seen.T.tocsr()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)  # cameras ask from near where they were
+        self.use(rig)
         self._vocabularies: list[Vocabulary] = []  # ahead and beside, with the idf of this map
         self._databases: list[PlaceDatabase] = []
         for corners in ([k.corners for k in self._keyframes], [k.sides for k in self._keyframes]):
@@ -119,7 +119,7 @@ class Relocalizer:
     def use(self, camera: Rig) -> None:
         """Use a corrected rig of the camera."""
         self.camera = camera
-        self._rig = widest([camera, *dict.fromkeys(self._own)])
+        self._rig = widest([camera, *dict.fromkeys(self._own)])  # whose pixels are compared
         self._cloud.cache_clear()
 
     def locate(self, keyframe: Keyframe) -> Location:
@@ -189,7 +189,7 @@ class Relocalizer:
             rows_a, rows_b = self._verify_near(keyframe, place.map_T_cam, row, sideways).rows.T
             parts.append(pair(self._view(keyframe, sideways), self._cloud(row, sideways), rows_b, rows_a))
         together = joined(parts)
-        if together.size < self.config.min_inliers:
+        if len(together.points_a) < self.config.min_inliers:
             return place
         b_T_a = se3.inverse(place.map_T_cam) @ self.map.map_T_kf[row]
         pose = refine_pose(b_T_a, together, self._rig, self.config.sigma_px)

@@ -155,6 +155,7 @@ def make_closer(
     if not config.closes_loops(rig.stereo, localize_only):
         return None
     from stereo_sfm.loop.closer import LoopCloser
+    from stereo_sfm.loop.vocabulary_file import configured_vocabulary
     from stereo_sfm.pipeline.restarting_closer import RestartingCloser
 
-    return RestartingCloser(lambda: LoopCloser(config.loop, rig, spans=spans))
+    return RestartingCloser(lambda: LoopCloser(config.loop, rig, configured_vocabulary(config.loop), spans))

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereo_sfm.calibration.rig_course import Course, Scatter, constant, steady
+from stereo_sfm.calibration.rig_course import Course, constant, steady
 from stereo_sfm.calibration.rig_window import RigInformation, RigWindow
 from stereo_sfm.types import F64, RIG_TERMS
 
 STATED = 2e-4  # standard deviation that windows state
-EXPECTED = Scatter(np.diag(np.full(RIG_TERMS, 1e-4**2)))
+EXPECTED = np.diag(np.full(RIG_TERMS, 1e-4**2))
 
 
 def windows(terms: F64, scatter: float, seed: int, alike: float = 0.0) -> list[RigWindow]:

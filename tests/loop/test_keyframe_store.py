@@ -58,5 +58,5 @@ def test_removed_keyframes_take_no_memory() -> None:
         store.add(keyframe(first + k, np.arange(50 * k, 50 * k + 100)))
         if k >= 10:
             store.remove(first + k - 10)
-    assert len(store._sightings) < 8000 and len(store._points) < 4000  # of 20,050 ids
+    assert len(store._sightings) < 8000 and len(store._points.ids) < 4000  # of 20,050 ids
     assert store.connected(np.arange(50 * 395, 50 * 395 + 100), 1) == [first + 394, first + 395, first + 396]

@@ -95,7 +95,7 @@ def test_a_corner_is_one_point_however_often_it_is_matched(there_and_back: Drive
     assert not join_corners(map_, sightings, 1.0)
     for name in ("uv_left", "uv_right"):
         assert np.array_equal(
-            getattr(map_.observations, name)[map_.observations_of_points(np.array([count]))],
+            getattr(map_.observations, name)[np.sort(map_.sightings(np.array([count]))[0])],
             [getattr(keyframes[0].sides, name)[1], getattr(keyframes[2].sides, name)[5]],
         )
     assert len(map_.points) == count + 2  # only one keyframe saw the third

@@ -83,7 +83,7 @@ def test_a_loop_removes_the_drift_and_moves_the_points(sequence: StoreSequence) 
     )
     assert len(done.fused) == len(loop.matches) > 20
     assert len(map_.living_points()) == alive - len(done.fused)
-    assert map_.neighbours(b)[0].tolist().count(a) == 1  # the two sides now share points
+    assert map_.neighbours(b).tolist().count(a) == 1  # the two sides now share points
 
 
 def turning_sequence(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 0.5) -> tuple[Map, F64]:

@@ -15,8 +15,8 @@ def test_ids_are_found_as_in_a_dictionary() -> None:
         expected.update(zip(part.tolist(), rows.tolist(), strict=True))
         asked = np.append(rng.integers(-5, 10_005, 50), part)
         assert table.find(asked).tolist() == [expected.get(k, -1) for k in asked.tolist()]
-        known = rng.random(len(table)) < 0.9
+        known = rng.random(len(table.ids)) < 0.9
         for gone in table.ids[~known].tolist():
             del expected[gone]
         table.keep(known)
-        assert len(table) == len(expected) and table.ids.nbytes + table.rows.nbytes == 12 * len(expected)
+        assert len(table.ids) == len(expected) and table.ids.nbytes + table.rows.nbytes == 12 * len(expected)

@@ -11,7 +11,7 @@ from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.bundle import BundleConfig, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop
-from stereo_sfm.mapping.level import Level, down_of, level_of
+from stereo_sfm.mapping.level import Level, level_of, mean_down
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.types import F64, LoopResult
@@ -108,9 +108,11 @@ def test_a_loop_is_closed_with_four_degrees_of_freedom(robust: str) -> None:
 def test_direction_of_gravity_in_the_map() -> None:
     map_, _, _ = drifting_map(0.0, True)
     rows = map_.living_keyframes()
-    assert np.degrees(np.linalg.norm(np.cross(down_of(map_, rows), DOWN))) < 0.02
-    nothing = drifting_map(0.0, False)[0]
-    assert not down_of(nothing, rows).any()
+    table, nothing = map_.keyframes, drifting_map(0.0, False)[0]
+    found = mean_down(table.map_T_kf[rows], table.down[rows], table.down_sigma[rows])
+    assert np.degrees(np.linalg.norm(np.cross(found, DOWN))) < 0.02
+    table = nothing.keyframes
+    assert not mean_down(table.map_T_kf[rows], table.down[rows], table.down_sigma[rows]).any()
     assert level_of(nothing, rows, np.zeros(len(rows), bool)) is None
     part = level_of(map_, rows, rows > 5)
     assert part is not None

@@ -146,7 +146,7 @@ def test_the_retail_papers_rule_uses_the_previous_keyframe_only() -> None:
     assert sum(len(u.fused_point_ids) for u in updates) == 0
     obs = mapper.map.observations
     for row in range(len(mapper.map.points)):
-        seen = np.sort(obs.kf[mapper.map.observations_of_points(np.array([row]))])
+        seen = np.sort(obs.kf[mapper.map.sightings(np.array([row]))[0]])
         assert len(seen) == 0 or seen[-1] - seen[0] < 8
     assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < error(odometry(stream), stream.world_T_kf)
 
