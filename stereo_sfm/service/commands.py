@@ -61,6 +61,9 @@ class Commands:
             return getattr(self, name)(**given)
         except (StereoSfmError, OSError) as error:
             return Reply(False, str(error))
+        except Exception:  # who asked is answered, and the service goes on
+            log.exception("the command %s failed", name)
+            return Reply(False, f"{name} failed: the service's log says why")
 
     def status(self) -> Reply:
         """State, health and settings that may change."""

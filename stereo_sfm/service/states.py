@@ -36,7 +36,9 @@ class Facts:
     _posed_ns: int = -1  # stamp of the newest frame with a pose
 
     def image(self, now_s: float) -> None:
-        """An image has come."""
+        """An image has come; the first one of a session begins without a loss."""
+        if self.starting:
+            self._posed_ns = -1
         if self.image_s:
             self._intervals.append(now_s - self.image_s)
             self.interval_s = median(self._intervals)

@@ -25,7 +25,8 @@ from stereo_sfm.messages import Compiling, Localized
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.service import recorder as service_recorder
 from stereo_sfm.service.camera import patient, same_camera
-from stereo_sfm.service.config import RecordingConfig
+from stereo_sfm.service.commands import Commands
+from stereo_sfm.service.config import RecordingConfig, RobotConfig
 from stereo_sfm.service.health import HealthCollector, free_bytes
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_cloud import MapCloudBuilder
@@ -95,9 +96,21 @@ def test_a_slow_source_and_a_busy_computer_are_no_loss(interval_s: float) -> Non
     facts.frame(61 * int(interval_s * 1e9), True, "")
     assert derive_state(facts, now)[0] == ServiceState.RUNNING
     assert derive_state(facts, now + max(1.0, 6 * interval_s) + 0.1)[0] == ServiceState.CAMERA_GONE
+    facts.starting = "the tracker is started again"
+    facts.image(now)
+    facts.frame(90 * int(interval_s * 1e9), False, "no pose yet")  # what a restart takes is no loss of the tracker
+    assert derive_state(facts, now)[0] == ServiceState.RUNNING
     facts.frame(5, False, "dark")  # another source, whose clock begins anew
     facts.image(now)
     assert derive_state(facts, now)[0] == ServiceState.RUNNING
+
+
+def test_a_command_that_fails_by_an_error_of_ours_is_answered_and_logged(caplog: pytest.LogCaptureFixture) -> None:
+    nothing: Any = None
+    commands = Commands(RobotConfig(), nothing, nothing, nothing, nothing, nothing)
+    reply = commands.call("reset")
+    assert not reply.ok and reply.text.startswith("reset failed")
+    assert "AttributeError" in caplog.text
 
 
 def test_velocity_and_covariance_are_those_of_the_body() -> None:
