@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import threading
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.messages import MapSaved
 from stereo_sfm.pipeline.processes import END_S, IN_FLIGHT_S, SAVE_END_S, ProcessRun
-from stereo_sfm.service import link, service
+from stereo_sfm.service import child, link, service
 from stereo_sfm.service.config import MapConfig, RobotConfig
 from stereo_sfm.service.link import OutputProcess
 from stereo_sfm.service.outputs import OUTPUTS, TIDY
@@ -110,5 +112,17 @@ def test_recorder_and_outputs_end_while_the_map_is_still_written(
     assert waited == [True]
 
 
-def test_outputs_that_tidy_up_at_their_exit_are_outputs() -> None:
-    assert OUTPUTS.keys() >= TIDY
+def ends(mark: str, tidy: bool, to_service: Connection) -> None:
+    """In a child whose library has something to remove at the interpreter's exit."""
+    atexit.register(Path(mark).touch)
+    child.TIDY_S = PATIENCE_S  # the test may share a busy computer
+    child.run_child("an output", to_service, lambda _: None, tidy)
+
+
+@pytest.mark.parametrize("tidy", [False, True])
+def test_libraries_of_an_output_clean_up_at_its_end_if_they_do_that_in_time(tmp_path: Path, tidy: bool) -> None:
+    """ROS 2 has files in shared memory; what others leave is closed by the system."""
+    process = child.start_child("an output", ends, str(tmp_path / "removed"), tidy, child.pipe()[1])
+    process.join(PATIENCE_S)
+    assert process.exitcode == 0 and (tmp_path / "removed").exists() == tidy
+    assert OUTPUTS.keys() >= TIDY >= {"ros2"}
