@@ -64,6 +64,10 @@ class WholeFile:
             os.replace(self.place, self.path)
         self._close()
 
+    def leave(self) -> None:
+        """Close it where it is: it is not whole, and an older file of its name stays. Once."""
+        self._close()
+
     def discard(self) -> None:
         """Close and remove it; an older file of its name stays."""
         if stat.S_ISREG(os.fstat(self.fd).st_mode):

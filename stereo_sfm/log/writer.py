@@ -213,10 +213,12 @@ class LogWriter:
             action()
         except OSError as error:
             self.closed = True
-            messages = repair.finish_in_place(self._whole.place)
-            self._file.close()
+            place = self._whole.place
+            messages = repair.finish_in_place(place)
+            self._whole.leave()
             self._failure = StereoSfmError(
-                f"recording stopped, {error.strerror or error}: {self.path} is closed and readable up to that point "
-                f"({messages} messages, {self.path.stat().st_size / 1e6:.1f} MB)"
+                f"recording stopped, {error.strerror or error}: {place} is closed and readable up to that point "
+                f"({messages} messages, {place.stat().st_size / 1e6:.1f} MB)"
+                + (f"; {self.path} is as it was" if place != self.path else "")
             )
             raise self._failure from None

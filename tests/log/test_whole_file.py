@@ -71,7 +71,7 @@ def test_the_older_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None
     assert _frames(path) == 1 and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_leaves_a_readable_file_in_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_a_readable_file_and_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "drive.mcap"
     write_recording(path, _source(3))
     writer = LogWriter(path, overwrite=True)
@@ -80,9 +80,14 @@ def test_a_full_disk_leaves_a_readable_file_in_its_place(tmp_path: Path, monkeyp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("stereo_sfm.log.writer.os.write", full)
-    with pytest.raises(StereoSfmError, match="is closed and readable"):
+    part = tmp_path / "drive.part.mcap"
+    with pytest.raises(StereoSfmError, match=r"drive.part.mcap is closed and readable .*drive.mcap is as it was"):
         writer.attach("a", "b")
-    assert list(tmp_path.iterdir()) == [path] and _frames(path) == 0
+    assert sorted(tmp_path.iterdir()) == [path, part] and (_frames(path), _frames(part)) == (3, 0)
+    monkeypatch.undo()
+    writer = LogWriter(path, overwrite=True)  # nobody holds them any more
+    writer.discard()
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_file_is_for_those_that_the_umask_allows(tmp_path: Path) -> None:
