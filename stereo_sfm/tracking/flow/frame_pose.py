@@ -53,7 +53,6 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 NEARER, WRONG_SIGMAS = 1.25, 2.0
 # Of the right camera's rotation, with which all distances err: 0 to 0.09 degrees in 15 published calibrations.
 RIG_SIGMA = math.radians(0.05)
-NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a degree of freedom of a pose may rest
 KNOWN_M = 0.005  # standard deviation of a position by the others with which such a point is left out if it is new
@@ -477,7 +476,7 @@ class FramePoseSolver:
 
     def _optimise_all(self, tracks: Tracks, start: ExpectedMotion, prior: ExpectedMotion | None) -> PoseSolution:
         sigma_px = self._config.sigma_px * self._noise
-        sigmas = NO_PRIOR if prior is None else np.repeat(self._usual_sigmas(prior, 1.0), 3)
+        sigmas = np.full(6, np.inf) if prior is None else np.repeat(self._usual_sigmas(prior, 1.0), 3)
         pose, velocity, covariance, error = pose_solver.optimise_pose(
             start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(), self._seen(tracks), self.cameras,
             sigma_px, CAUCHY_SCALES, start.pose if prior is None else prior.pose, sigmas,

@@ -22,7 +22,6 @@ from stereo_sfm.tracking.flow.windows import SIZE, STRIDE
 from stereo_sfm.types import F32, F64, I64, U8
 
 GRAZING = 0.15  # cosine between a surface's normal and the ray, below which the surface shows nothing
-DELTA_PX = 1.0  # for differences
 MAX_STRETCH = 3.0  # of a window, in any direction
 COARSE = SIZE // 2  # samples of a window in the half image, along each side
 SAMPLES = COARSE * COARSE
@@ -39,7 +38,7 @@ def surfaces_around(camera: Camera, uv: F64, points: F64) -> F64:
     """
     out = np.full((3, 4, len(uv), 3), np.nan)
     bearings = points / np.linalg.norm(points, axis=1)[:, None]
-    rays = [camera.unproject(uv + sign * step) for step in DELTA_PX * np.eye(2) for sign in (1.0, -1.0)]
+    rays = [camera.unproject(uv + sign * step) for step in np.eye(2) for sign in (1.0, -1.0)]
     for axis in range(3):
         facing = np.flatnonzero(np.abs(bearings[:, axis]) >= GRAZING)
         depth = points[facing, axis]
@@ -72,7 +71,7 @@ def _warps(model, params, surfaces, new_T_old):
             squared = 0.0
             for i in range(2):
                 for k in range(2):
-                    value = (ends[2 * k, i] - ends[2 * k + 1, i]) / (2 * DELTA_PX)
+                    value = (ends[2 * k, i] - ends[2 * k + 1, i]) / 2
                     out[axis, n, i, k] = value
                     squared += value * value
             stretch = math.sqrt(0.5 * squared)

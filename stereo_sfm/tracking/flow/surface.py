@@ -25,7 +25,6 @@ CELL = 4  # px, side of the cells whose residuals are tested
 CELLS = SIZE // CELL
 NOISE = 2.0  # grey levels, of the difference of two pixels
 INTERPOLATION = 0.1  # px, noise of interpolation: times the gradient, in grey levels
-SPREAD = 0.25  # 1 / root of the number of independent measurements of disparity in a window
 DAMPING = 0.02  # of the plane's slopes, as a share of the information about the disparity itself
 
 
@@ -131,7 +130,8 @@ def fit_planes(left, right, uv, uv_right, cameras, weights, coordinates):
                 worst = max(worst, total / (CELL * CELL))
         misfit[k] = worst
         information = known - normal[3, 0] * normal[3, 0] / normal[3, 3]  # with a shift across the curve eliminated
-        sigma[k] = SPREAD * math.sqrt(dot(window, weights) / max(information, 1e-6))
+        # Each of CELLS^2 cells measures the disparity once.
+        sigma[k] = math.sqrt(dot(window, weights) / max(information, 1e-6)) / CELLS
         out[k, 0] = ur - (x[0] * eu - x[3] * ev)
         out[k, 1] = vr - (x[0] * ev + x[3] * eu)
     return out, misfit, sigma
