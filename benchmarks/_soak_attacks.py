@@ -55,7 +55,7 @@ class Turns:
         self.delays: dict[tuple[bool, bool], list[float]] = {turn: [] for turn in TURNS}
         self._turn: tuple[bool, bool] | None = None
         self._counts_from_s = math.inf
-        self._over = threading.Event()
+        self._over, self._rest = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def start(self) -> None:
@@ -67,6 +67,10 @@ class Turns:
         self._over.set()
         if self._thread.is_alive():
             self._thread.join()
+
+    def rest(self) -> None:
+        """What remains has attacks every other minute and no busy loops: it is to come to an end."""
+        self._rest.set()
 
     def session(self) -> None:
         """A session begins."""
@@ -81,6 +85,8 @@ class Turns:
     def _work(self) -> None:
         spawn = multiprocessing.get_context("spawn")
         for busy, attacked in itertools.cycle(TURNS):
+            if busy and self._rest.is_set():
+                continue
             loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY * busy)]
             attacker = spawn.Process(target=attack, args=(self._target,), daemon=True) if attacked else None
             if attacker is not None:

@@ -11,7 +11,8 @@ camera time (without the first half hour after its start), every fault and how l
 images, delays in the part by the clock, recordings against their quota. The exit code is 1 if anything is wrong.
 
 With `--attacks`, minutes without and with attacks, and both beside eight busy loops, alternate in the part by the
-clock; printed is how many poses of each were late. Not more may be with attacks than without.
+clock; printed is how many poses of each were late. Not more may be with attacks than without. Minutes with and without
+attacks go on after it.
 """
 
 from __future__ import annotations
@@ -171,6 +172,8 @@ class Watch:
             self.arrived.extend((pose.captured_s, time.monotonic()))
             if self.turns is not None:
                 self.turns.pose(pose.captured_s)
+        elif self.turns is not None:
+            self.turns.rest()
 
     def start(self, started: Started) -> None:
         if started.session > self.session:  # else it tells how the camera is mounted
