@@ -16,6 +16,7 @@ from stereo_sfm.types import F64, I64, Trajectory
 _XYZW = (0, 1, 2, 3)
 _WXYZ = (1, 2, 3, 0)
 POSITION = 4  # fields of a row with a stamp and a position only
+FARTHEST = 1e9  # metres from the origin: no coordinates on this planet are as large, and their squares are numbers
 
 
 def stamp_from_seconds(text: str) -> int:
@@ -64,6 +65,7 @@ def _trajectory(path: Path, stamps: list[int], values: list[list[str]], order: t
         table = np.array(values, float)
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
+    _check_range(path, table)
     oriented = table.shape[1] == 7 and not _never_turns(table[:, 3:][:, list(order)])
     keep = np.isfinite(table).all(axis=1)
     if oriented:
@@ -77,6 +79,12 @@ def _trajectory(path: Path, stamps: list[int], values: list[list[str]], order: t
     if oriented:
         rotation = se3.rotation_from_quaternion(table[first, 3:][:, list(order)])
     return Trajectory(ascending, se3.from_rotation_translation(rotation, table[first, :3]), oriented)
+
+
+def _check_range(path: Path, values: F64) -> None:
+    """Raises StereoSfmError for numbers that are in no pose; those that are none are left to others."""
+    if (np.abs(values[np.isfinite(values)]) > FARTHEST).any():
+        raise StereoSfmError(f"{path}: a pose has a number beyond {FARTHEST:g}")
 
 
 def _never_turns(xyzw: F64) -> bool:
@@ -122,6 +130,7 @@ def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
         raise StereoSfmError(f"{path}: {error}") from None
     if not np.isfinite(matrices).all():
         raise StereoSfmError(f"{path}: pose {int(np.flatnonzero(~np.isfinite(matrices).all((1, 2)))[0])} is not finite")
+    _check_range(path, matrices)
     stamps = np.arange(len(rows), dtype=np.int64) * 10**9 if stamp_ns is None else np.asarray(stamp_ns, np.int64)
     count = min(len(stamps), len(rows))
     poses = se3.from_rotation_translation(matrices[:count, :, :3], matrices[:count, :, 3])

@@ -1,17 +1,27 @@
-"""Files that a user names: regular ones only, and of a size that can be what they claim to be."""
+"""Files that a user names: regular ones only, and of a size that can be what they claim to be.
+
+JSON and YAML, too: values may be nested more deeply than a parser can follow, and the aliases of a few hundred bytes of
+YAML expand to billions of values.
+"""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import stat
 from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
 MOST_TEXT = 1 << 30  # bytes of a text: a trajectory of a day at 30 Hz has some 200 MB
 MOST_BYTES = 2 << 30  # of any file that is read as a whole
+MOST_JSON = 64 << 20  # bytes: the numbers of a run of a day have one
+MOST_DEPTH = 32  # of YAML
+MOST_VALUES = 1_000_000  # of YAML, with every alias written out
+MOST_CHARS = 1 << 16  # of one value of YAML
 
 
 class NotAFile(StereoSfmError, OSError):
@@ -72,3 +82,84 @@ def read_text(path: Path, most: int = MOST_TEXT, encoding: str = "utf-8-sig") ->
         OSError: it cannot be read. UnicodeError: it is something else.
     """
     return read_bytes(path, most).decode(encoding)
+
+
+def read_json(path: Path, most: int = MOST_JSON) -> Any:
+    """The value in a file.
+
+    Raises:
+        NotAFile: it is no regular file, or is larger than this many bytes.
+        OSError: it cannot be read. ValueError: it is not JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(read_text(path, most))
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def read_yaml(path: Path, most: int) -> Any:
+    """The value in a file.
+
+    Args:
+        path: the file. most: bytes.
+
+    Raises:
+        NotAFile: it is no regular file, or is larger.
+        OSError: it cannot be read. ValueError: as `count_values`.
+    """
+    import yaml
+
+    text = read_text(path, most)
+    count_values(text)
+    try:
+        return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # not every build has the fast one
+    except yaml.YAMLError as error:
+        raise ValueError(_said(error)) from None
+
+
+def count_values(text: str, before: int = 0) -> int:
+    """How many values YAML has with every alias written out, added to those counted before; none of them is made.
+
+    Raises:
+        ValueError: it is not YAML, or nested more deeply, or with larger or more values than the limits here.
+    """
+    import yaml
+
+    try:
+        return _count(text, before)
+    except yaml.YAMLError as error:
+        raise ValueError(_said(error)) from None
+
+
+def _count(text: str, total: int) -> int:
+    import yaml
+    from yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, ScalarEvent
+
+    named: dict[str | None, int] = {}  # values of what an alias may name
+    inside: list[tuple[str | None, int]] = []  # the collections that are open: name, values before them
+    for event in yaml.parse(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+        if isinstance(event, AliasEvent):
+            if event.anchor not in named or any(name == event.anchor for name, _ in inside):
+                raise ValueError("a value contains itself")
+            total += named[event.anchor]
+        elif isinstance(event, CollectionStartEvent):
+            inside.append((event.anchor, total))
+            total += 1
+        elif isinstance(event, CollectionEndEvent):
+            name, before = inside.pop()
+            named[name] = total - before
+        elif isinstance(event, ScalarEvent):
+            named[event.anchor] = 1
+            total += 1
+            if len(event.value) > MOST_CHARS:
+                raise ValueError(f"a value has {len(event.value)} characters")
+        if len(inside) > MOST_DEPTH:
+            raise ValueError("nested too deeply")
+        if total > MOST_VALUES:
+            raise ValueError(f"it has more than {MOST_VALUES} values with every alias written out")
+    return total
+
+
+def _said(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    return f"not YAML{f' (line {mark.line + 1})' if mark else ''}"

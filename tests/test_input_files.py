@@ -11,13 +11,15 @@ from typing import Any
 
 import pytest
 
+from stereo_sfm import input_file
 from stereo_sfm.calib import load_rig
 from stereo_sfm.calib.mask import read_mask
+from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.folder_source import UnreadableImage, read_gray
 from stereo_sfm.drivers.ground_truth import read_trajectory
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.compare import stats_of
-from stereo_sfm.input_file import NotAFile, read_bytes
+from stereo_sfm.input_file import NotAFile, count_values, read_bytes, read_json, read_yaml
 from stereo_sfm.loop.vocabulary_file import load_vocabulary
 from stereo_sfm.maps.header import read_header
 from stereo_sfm.maps.saved_map import load_map, save_map
@@ -77,10 +79,24 @@ def _read_rig_of_map(path: Path) -> object:
     return load_map(folder)
 
 
+def _read_bag(path: Path) -> object:
+    """In a folder of which only one file is no file."""
+    for name, text in (
+        ("metadata.yaml", "rosbag2_bagfile_information: {topics_with_message_count: []}"),
+        ("a.db3", ""),
+    ):
+        if not (path.parent / name).exists():
+            (path.parent / name).write_text(text)
+    return open_source(f"rosbag:{path.parent}")
+
+
 READS: dict[str, Callable[[Path], Any]] = {
     "a.kitti": load_rig, "rig.yaml": load_rig, "mask.png": read_mask, "image.png": read_gray,
     "truth.csv": read_trajectory, "map.json": lambda p: read_header(p.parent, ()),
     "stats.json": lambda p: stats_of(p.parent), "words.npz": load_vocabulary, "of_a_map.yaml": _read_rig_of_map,
+    "drive.bag": lambda p: open_source(f"rosbag:{p}"), "alone.db3": lambda p: open_source(f"rosbag:{p}"),
+    "alone.mcap": lambda p: open_source(f"rosbag:{p}"), "in_a_folder.db3": _read_bag, "in_a_folder.mcap": _read_bag,
+    "result.json": read_json,
 }  # fmt: skip
 
 
@@ -103,3 +119,45 @@ def test_a_refused_file_is_both_kinds_of_error(tmp_path: Path) -> None:
         read_bytes(tmp_path)
     assert isinstance(error.value, OSError) and isinstance(error.value, StereoSfmError)
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
+
+
+def test_json_that_is_nested_for_ever(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="nested too deeply"):
+        read_json(tmp_path / "a.json")
+
+
+def test_values_of_yaml_are_counted_before_they_are_made(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("a: &a [1, 2]\nb: {<<: {c: 3}, d: [*a, *a]}\n")
+    assert read_yaml(path, 100) == {"a": [1, 2], "b": {"c": 3, "d": [[1, 2], [1, 2]]}}
+    assert count_values(path.read_text()) == 19 and count_values("", 5) == 5
+    with pytest.raises(NotAFile, match="more than"):
+        read_yaml(path, 10)
+
+
+def _doubled(form: str) -> str:
+    return "a0: &a0 {x: 1}\n" + "".join(f"a{i}: &a{i} {form.format(f'*a{i - 1}, *a{i - 1}')}\n" for i in range(1, 40))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[" * 100_000, "nested too deeply"),
+        ("{a: " * 100_000, "nested too deeply"),
+        (_doubled("[{}]"), "more than 1000000 values"),
+        (_doubled("{{<<: [{}]}}"), "more than 1000000 values"),
+        ("a: &a {<<: *a}", "contains itself"),
+        ("a: &a [*a]", "contains itself"),
+        ("a: &a [1]\nb: &a [*a]", "contains itself"),
+        ("a: *b", "contains itself"),
+        ("a: [1" + ":59" * 100_000 + "]", "characters"),
+        ("a: [1, 2\nb: 3", r"not YAML \(line 2\)"),
+        ("a: !!python/object:os.system {}", "not YAML"),
+        ("{[1]: 2}: 3", "not YAML"),
+    ],
+)
+def test_yaml_that_no_parser_should_see(text: str, says: str, tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text(text)
+    with pytest.raises(ValueError, match=says):
+        read_yaml(tmp_path / "a.yaml", input_file.MOST_TEXT)

@@ -41,6 +41,8 @@ def _files(folder: Path) -> list[Path]:
 def _recognise(path: Path) -> Certainty:
     if path.is_file():
         return Certainty.MARKED if path.suffix in (".bag", ".db3") else Certainty.NO
+    if not path.is_dir():
+        return Certainty.NO
     about = path / "metadata.yaml"
     if not about.is_file():
         ours = (path / RECORDING).is_file()

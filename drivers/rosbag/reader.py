@@ -17,8 +17,12 @@ import numpy as np
 from mcap.records import Channel, Schema
 
 from stereo_sfm.drivers.mcap.foreign import ForeignSource
+from stereo_sfm.drivers.rosbag.checked import check_bag
+from stereo_sfm.drivers.rosbag.unpacked import from_zstd, limit_chunks, take_unpacking
 from stereo_sfm.drivers.source import Stamps
 from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.input_file import NotAFile
+from stereo_sfm.log.chunks import DAMAGE
 from stereo_sfm.log.reader import Record, TopicInfo
 
 if TYPE_CHECKING:
@@ -73,6 +77,7 @@ class BagReader:
         self.by_time = True  # always
         self._ros_1 = path.suffix == _SUFFIX_ROS_1
         self._types = get_typestore(Stores.LATEST)
+        self._packed = False  # each message is compressed
         self._reader: Any = self._opened()
         self._channels = {c.id: self._described(c) for c in self._reader.connections}
 
@@ -80,14 +85,19 @@ class BagReader:
         from rosbags import rosbag1, rosbag2
 
         try:
+            check_bag(self.path)
             reader = rosbag1.Reader(self.path) if self._ros_1 else rosbag2.Reader(self.path)
             reader.open()
-            numbers: list[Any] = [reader.start_time, reader.end_time, *(c.msgcount for c in reader.connections)]
-            if not all(isinstance(n, int) and abs(n) < 1 << 63 for n in numbers):
-                raise ValueError("a count or a time of its metadata is not a number")
+            _check_numbers(reader)
+            if self._ros_1:
+                limit_chunks(reader)
+            else:
+                self._packed = take_unpacking(reader)
         except FileNotFoundError:
             raise StereoSfmError(f"no bag at {self.path}") from None
-        except (*self._damage, TypeError, AttributeError) as error:
+        except NotAFile:
+            raise
+        except self._damage as error:
             raise StereoSfmError(f"{self.path} cannot be read as a ROS bag: {_said(error)}") from None
         return reader
 
@@ -99,7 +109,7 @@ class BagReader:
         from rosbags.serde import SerdeError
 
         ours = (rosbag1.ReaderError, rosbag2.ReaderError, SerdeError, apsw.Error, sqlite3.Error, zlib.error)
-        return (*ours, OSError, ValueError, IndexError, KeyError, AssertionError, EOFError)
+        return (*DAMAGE, *ours, OSError, AssertionError, TypeError, AttributeError)
 
     def close(self) -> None:
         """Close the files; may be called twice."""
@@ -135,6 +145,7 @@ class BagReader:
             return
         try:
             for connection, time_ns, raw in self._reader.messages(wanted, start, None if until is None else until + 1):
+                _check_message(time_ns, raw)
                 data = self._cdr(raw, connection.msgtype)
                 if data is not None:
                     channel, schema = self._channels[connection.id]
@@ -149,13 +160,26 @@ class BagReader:
     def _cdr(self, raw: bytes, kind: str) -> bytes | None:
         """A message in CDR; None for a type of ROS 1 that ROS 2 does not have."""
         if not self._ros_1:
-            return bytes(raw)
+            return from_zstd(raw) if self._packed else bytes(raw)
         return bytes(self._types.ros1_to_cdr(raw, kind)) if kind in self._types.fielddefs else None
 
     @staticmethod
     def _described(connection: Any) -> tuple[Channel, Schema]:
         schema = Schema(connection.id, b"", "ros2msg", connection.msgtype)
         return Channel(connection.id, connection.topic, "cdr", {}, connection.id), schema
+
+
+def _check_numbers(reader: Any) -> None:
+    """Raises ValueError for counts and times that are no numbers, as they stand in a text."""
+    numbers: list[Any] = [reader.start_time, reader.end_time, *(c.msgcount for c in reader.connections)]
+    if not all(isinstance(n, int) and abs(n) < 1 << 63 for n in numbers):
+        raise ValueError("a count or a time of its metadata is not a number")
+
+
+def _check_message(time_ns: Any, raw: Any) -> None:
+    """Raises ValueError for a row of a table that holds something else: each of its fields may hold anything."""
+    if not (isinstance(time_ns, int) and abs(time_ns) < 1 << 63 and isinstance(raw, bytes)):
+        raise ValueError("a message without time or content")
 
 
 def _said(error: Exception) -> str:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import read_json
 
 if TYPE_CHECKING:
     from stereo_sfm.eval.evaluate import Evaluation
@@ -216,7 +216,7 @@ def _pose_frame(path: Path) -> str:
     if path.suffix != ".kitti" or not stats.is_file():
         return ""
     try:
-        return json.loads(read_text(stats)).get("frame", "")
+        return read_json(stats).get("frame", "")
     except (ValueError, AttributeError):  # damaged
         return ""
 

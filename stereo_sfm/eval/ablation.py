@@ -24,7 +24,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.statistics import stage_times
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import read_json
 from stereo_sfm.presets import preset
 from stereo_sfm.types import Trajectory
 
@@ -188,10 +188,10 @@ def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[
 def load_result(path: Path) -> dict[str, Any] | None:
     """A finished cell's file, or None where there is none or it was cut off."""
     try:
-        data = json.loads(read_text(path))
-    except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
+        data = read_json(path)
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
-    return data if data.get("schema") == _SCHEMA else None
+    return data if isinstance(data, dict) and data.get("schema") == _SCHEMA else None
 
 
 def finished(result: dict[str, Any] | None) -> bool:

@@ -16,8 +16,9 @@ from typing import Any
 
 from stereo_sfm.config import Config, dump
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.eval.tables import write_table
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import read_json
 from stereo_sfm.jobs import Job, Limits, run_jobs
 
 RESULT = "result.json"
@@ -89,10 +90,11 @@ def finished(task: BatchTask) -> dict[str, Any] | None:
     """The result of an earlier batch with the same recording and configuration, if it went well."""
     path = Path(task.folder) / RESULT
     try:
-        result = json.loads(read_text(path))
-    except (OSError, ValueError):
+        result = read_json(path)
+        same = result["ok"] and result["recording"] == task.spec and result["config"] == dump(task.config)
+        checked_stats(result["stats"])
+    except (OSError, ValueError, LookupError, TypeError):
         return None
-    same = result.get("ok") and result.get("recording") == task.spec and result.get("config") == dump(task.config)
     has_map = not task.map_out or (Path(task.folder) / "map" / "map.json").exists()
     return result if same and has_map else None
 

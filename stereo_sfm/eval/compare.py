@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from stereo_sfm.config import parse_toml
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval import plots
 from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
 from stereo_sfm.eval.html_page import take_plots, to_html
+from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.eval.tables import write_table
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import read_json, read_text
 from stereo_sfm.types import Trajectory
 
 COLUMNS = (
@@ -48,7 +48,7 @@ def stats_of(folder: Path) -> dict[str, Any]:
         StereoSfmError: not the folder of a run.
     """
     try:
-        return json.loads(read_text(folder / "stats.json"))
+        return checked_stats(read_json(folder / "stats.json"))
     except (OSError, ValueError):
         raise StereoSfmError(f"{folder} is not the folder of a run: its stats.json cannot be read") from None
 
@@ -126,7 +126,7 @@ def changed_settings(folders: Sequence[Path]) -> list[list[str]]:
 def _settings(path: Path) -> dict[str, str]:
     """Values as text by dotted name."""
     try:
-        tree = tomllib.loads(read_text(path))
+        tree = parse_toml(read_text(path))
     except (OSError, ValueError):
         raise StereoSfmError(f"{path} cannot be read: is this the folder of a run?") from None
     found: dict[str, str] = {}

@@ -13,11 +13,12 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan, description
-from stereo_sfm.input_file import read_bytes, read_text
+from stereo_sfm.input_file import read_bytes, read_yaml
 from stereo_sfm.pixels import decode
 from stereo_sfm.types import U8, Bool
 
 DRAWING, ABOUT, MASK = "keepout.png", "keepout.yaml", "keepout_mask"
+MOST_ABOUT = 1 << 16  # bytes
 RED = (40, 40, 220)  # blue, green, red
 STANDS_OUT = 60  # by which red exceeds green and blue where something is drawn
 
@@ -29,7 +30,6 @@ def read_zones(folder: Path, plan: FloorPlan) -> Bool:
         StereoSfmError: the drawing or its description is damaged.
     """
     import cv2
-    import yaml
 
     zones = np.zeros(plan.image.shape, bool)
     if not (folder / DRAWING).is_file():
@@ -39,9 +39,9 @@ def read_zones(folder: Path, plan: FloorPlan) -> Bool:
     except (OSError, ValueError):
         raise StereoSfmError(f"{folder / DRAWING} is not an image: remove it to begin with an empty drawing") from None
     try:
-        about: Any = yaml.safe_load(read_text(folder / ABOUT))
+        about: Any = read_yaml(folder / ABOUT, MOST_ABOUT)
         resolution, origin = float(about["resolution"]), np.array(about["origin"][:2], float)
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
+    except (OSError, KeyError, TypeError, ValueError):
         raise StereoSfmError(f"{folder / ABOUT} does not say where the drawing lies: remove {DRAWING} too") from None
     blue, green, red = (drawn[..., k].astype(int) for k in range(3))
     rows, columns = np.nonzero((red - np.maximum(blue, green) > STANDS_OUT)[::-1])  # the first row has the least y

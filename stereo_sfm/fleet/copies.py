@@ -16,7 +16,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet.patches import expanded
 from stereo_sfm.fleet.versions import StoredFile, Version, patch_name, read_file, read_version, released
 from stereo_sfm.folder_lock import FolderLock
-from stereo_sfm.input_file import read_bytes, read_text
+from stereo_sfm.input_file import read_bytes, read_json
 from stereo_sfm.maps.replace_folder import recover, replaced_folder
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import cache_root, fetch, sha256
@@ -41,7 +41,7 @@ class Fetched:
 def version_of(folder: Path) -> tuple[str, int]:
     """Name and number of the version in a folder; "" and 0 if it is none."""
     try:
-        data = json.loads(read_text(folder / STATE))
+        data = read_json(folder / STATE)
         return str(data["version"]), int(data["number"])
     except (OSError, ValueError, KeyError, TypeError):
         return "", 0

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import read_json
 
 VERSION = 5  # 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
 KIND = "stereo_sfm_map"
@@ -45,9 +45,9 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
     if not path.is_file():
         raise StereoSfmError(f"no map at {folder}: there is no map.json (create one with 'run ... --map-out')")
     try:
-        head = json.loads(read_text(path))
+        head = read_json(path)
         version = head["version"] if head["kind"] == KIND else None
-    except (ValueError, KeyError, TypeError, OSError, RecursionError):
+    except (ValueError, KeyError, TypeError, OSError):
         raise damaged(folder, "map.json cannot be read") from None
     if version not in range(2, VERSION + 1):
         raise StereoSfmError(

@@ -19,7 +19,7 @@ import yaml
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
-from stereo_sfm.input_file import read_bytes, read_text
+from stereo_sfm.input_file import read_bytes, read_yaml
 from stereo_sfm.maps.floor import find_floor
 from stereo_sfm.maps.labels import Aisle, Door
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
@@ -111,12 +111,12 @@ def read_about(store: Path, saved: SavedMap | None = None) -> About:
     if not path.is_file():
         return About(0, find_floor((saved or load_current(store)).snapshot))
     try:
-        data: Any = yaml.safe_load(read_text(path, MOST_ABOUT))
+        data: Any = read_yaml(path, MOST_ABOUT)
         aisles = tuple(Aisle(*_line(line)) for line in data["aisles"])
         doors = tuple(Door(*_line(line)) for line in data.get("doors", ()))
         pose = np.array(data["map_T_floor"], float).reshape(4, 4)
         return About(int(data["version"]), pose, aisles, doors)
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, OSError, RecursionError):
+    except (AttributeError, KeyError, TypeError, ValueError, OSError):
         raise StereoSfmError(f"{path} is damaged: correct it, or remove it to begin without labels") from None
 
 

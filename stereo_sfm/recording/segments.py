@@ -24,7 +24,7 @@ from typing import Any
 
 from stereo_sfm.drivers.mcap import IMAGES, RECORDING
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.input_file import open_regular, read_bytes, read_text
+from stereo_sfm.input_file import open_regular, read_bytes, read_json
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.scan import summary_is_whole
@@ -182,7 +182,7 @@ def describe(folder: Path, source: str, mode: str, began: datetime) -> None:
 def about(folder: Path) -> dict[str, Any]:
     """The content of recording.json; empty where it is missing or damaged."""
     try:
-        data = json.loads(read_text(folder / RECORDING))
+        data = read_json(folder / RECORDING)
     except (OSError, ValueError):
         return {}
     return data if isinstance(data, dict) and data.get("kind") == KIND else {}

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import os
 import shutil
+import sqlite3
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.cli import main
+from stereo_sfm.drivers import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.reader import LogReader
@@ -71,6 +76,70 @@ def test_a_bag_that_counts_in_words(tmp_path: Path, capsys: pytest.CaptureFixtur
         "offered_qos_profiles: ''}\n  files: []\n"
     )
     _one_line(capsys, ["info", str(bag)], "cannot be read as a ROS bag")
+
+
+_QOS = "offered_qos_profiles: []"
+_MERGED = "a0: &a0 {x: 1}\n" + "".join(f"a{i}: &a{i} {{<<: [*a{i - 1}, *a{i - 1}]}}\n" for i in range(1, 40))
+
+
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """By their kind."""
+    pytest.importorskip("rosbags")
+    from tests.drivers.ros_bags import KINDS, write_bag
+
+    folder = tmp_path_factory.mktemp("bags")
+    found: dict[str, Path] = {}
+    with open_source("sim:loop?size=80x64&frames=3&imu=t265") as source:
+        images = list(source)
+        for number, kind in enumerate(KINDS):
+            (folder / str(number)).mkdir()
+            found[kind] = write_bag(folder / str(number), kind, source.rig, images)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a: " + "[" * 10_000, "nested too deeply"),
+        (_MERGED, "values with every alias"),
+        ("a: &a {<<: *a}", "contains itself"),
+        ("a: [", "not YAML"),
+    ],
+)
+@pytest.mark.parametrize("place", ["text", "text in the text", "text in the table"])
+def test_metadata_of_a_bag_that_no_parser_should_see(
+    text: str, says: str, place: str, bags: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = shutil.copytree(bags["folder of .db3"], tmp_path / "bag")
+    about = bag / "metadata.yaml"
+    if place == "text":
+        about.write_text(about.read_text() + text)
+    elif place == "text in the text":
+        about.write_text(about.read_text().replace(_QOS, f"offered_qos_profiles: {json.dumps(text)}"))
+    else:
+        with closing(sqlite3.connect(bag / "bag.db3")) as base:
+            base.execute("UPDATE topics SET offered_qos_profiles = ?", (text,))
+            base.commit()
+    _one_line(capsys, ["info", str(bag)], "bag", says)
+
+
+def test_metadata_of_a_bag_that_is_a_film(
+    bags: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = shutil.copytree(bags["folder of .mcap"], tmp_path / "bag")
+    with (bag / "metadata.yaml").open("ab") as file:
+        file.truncate(1 << 40)
+    _one_line(capsys, ["info", str(bag)], "metadata.yaml", "more than 4")
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap"])
+def test_a_bag_that_is_a_pipe(suffix: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rosbags")
+    pipe = tmp_path / f"drive{suffix}"
+    os.mkfifo(pipe)
+    _one_line(capsys, ["info", f"rosbag:{pipe}"], "it is not a file")
+    _one_line(capsys, ["info", str(pipe)], "not a known kind")
 
 
 @pytest.mark.parametrize("noise", [1e308, 1e-300, 0.0, float("nan")])

@@ -6,20 +6,26 @@ import functools
 import json
 import logging
 import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
+from rosbags import rosbag1
 
 from stereo_sfm.cli import main
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.registry import recognise
+from stereo_sfm.drivers.rosbag import unpacked
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.system import Tracker
 from stereo_sfm.types import F64, StereoImage, WheelSamples
 from tests.drivers.ros_bags import FRAMES, KINDS, BagWriter, write_bag
+from tests.fuzz.formats import pack_messages
 
 SIMULATED = "sim:loop?size=212x200&frames=12&start=40&imu=t265"
 
@@ -204,6 +210,56 @@ def _error_of(path: Path) -> str:
     except StereoSfmError as error:
         return str(error)
     return ""
+
+
+def _rewritten(path: Path, kind: str) -> Path:
+    """A bag with its chunks, or in a folder its messages, compressed."""
+    if path.is_dir():
+        pack_messages(path, zstandard.compress)
+        return path
+    writer = rosbag1.Writer(path.with_name(f"{kind}.bag"))
+    writer.set_compression(rosbag1.Writer.CompressionFormat[kind])
+    with rosbag1.Reader(path) as reader, writer:
+        of = {
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
+            for c in reader.connections
+        }
+        for connection, time_ns, data in reader.messages():
+            writer.write(of[connection.id], time_ns, data)
+    return writer.path
+
+
+@pytest.mark.parametrize("kind", ["BZ2", "LZ4", "message"])
+def test_compressed_bags_are_read_up_to_a_limit(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, images = _simulated()
+    path = _rewritten(write_bag(tmp_path, KINDS[0] if kind == "message" else ".bag", source.rig, images), kind)
+    with open_source(path) as bag:
+        for a, b in zip(bag, images, strict=True):
+            np.testing.assert_array_equal(a.left, b.left)
+    monkeypatch.setattr(unpacked, "MAX_BYTES", 10_000)
+    assert "is damaged: a compressed part has more than 10000 bytes" in _error_of(path)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("timestamp", "'now'"), ("timestamp", 1.5), ("data", "NULL"), ("data", 7)]
+)
+def test_rows_of_something_else_are_one_line(column: str, value: object, tmp_path: Path) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, KINDS[0], source.rig, images[:3])
+    with closing(sqlite3.connect(path / "bag.db3")) as base:
+        base.executescript(
+            "CREATE TABLE other(id INTEGER PRIMARY KEY, topic_id, timestamp, data);"
+            "INSERT INTO other SELECT * FROM messages; DROP TABLE messages; ALTER TABLE other RENAME TO messages;"
+            f"UPDATE messages SET {column} = {value} WHERE id > 5;"
+        )
+    assert _error_of(path) == f"{path} is damaged: a message without time or content"
+
+
+@pytest.mark.parametrize("name", ["a?b", "a#b", "a%20b"])
+def test_names_that_the_library_takes_for_others(name: str, tmp_path: Path) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, KINDS[0], source.rig, images[:3]).rename(tmp_path / name)
+    assert "for another path: rename" in _error_of(path)
 
 
 def test_a_missing_topic_and_a_missing_place_are_one_line(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Runs commands one after the other in a process of bounded memory and reports their results.
 
-Reads one JSON list of arguments a line, writes one JSON object a line. "frames PATH" reads every frame of a source.
+Reads one JSON list of arguments a line, writes one JSON object a line. "frames PATH" reads every frame of a source,
+"recordings PATH" lists the recordings of a service, "earlier PATH" reads the result of a batch of "a.mcap".
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import resource
 import sys
 import time
 import traceback
+from pathlib import Path
 from typing import Any
 
 HEADROOM = 1 << 30  # bytes of address space beyond what the program needs when it is loaded
@@ -32,6 +34,30 @@ def frames(path: str) -> int:
     return 0
 
 
+def recordings(path: str) -> int:
+    """List recordings as the page of a service does."""
+    from stereo_sfm.recording.segments import listed, recordings, segments
+
+    for folder in recordings(Path(path)):
+        json.dumps(listed(folder))
+        assert all(isinstance(part.sent and part.marked_by_hand, bool) for part in segments(folder))
+    return 0
+
+
+def earlier(path: str) -> int:
+    """Make a row of an earlier result as a batch does that goes on."""
+    from stereo_sfm.config import Config
+    from stereo_sfm.eval.batch import BatchTask, finished, table_row, write_results
+
+    result = finished(BatchTask("a.mcap", path, Config(), False))
+    if result is not None:
+        write_results([table_row("a", result)], Path(path))
+    return 0
+
+
+OWN = {"frames": frames, "recordings": recordings, "earlier": earlier}
+
+
 def outcome(argv: list[str]) -> dict[str, Any]:
     """Exit code (None after an exception that no command should raise), standard error, processor seconds."""
     from stereo_sfm.cli import main
@@ -40,7 +66,7 @@ def outcome(argv: list[str]) -> dict[str, Any]:
     message, began = io.StringIO(), time.process_time()
     with contextlib.redirect_stderr(message), contextlib.redirect_stdout(io.StringIO()):
         try:
-            code = frames(argv[1]) if argv[0] == "frames" else main(argv)
+            code = OWN[argv[0]](argv[1]) if argv[0] in OWN else main(argv)
         except SystemExit as end:
             code = int(end.code or 0)
         except BaseException:  # whatever it is, it is what the test looks for

@@ -1,10 +1,15 @@
-"""Seeded damage to files: bytes for any format, words and lines for text."""
+"""Seeded damage to files: bytes for any format, words and lines for text, values of JSON."""
 
 from __future__ import annotations
 
+import json
 import random
+from typing import Any
 
 WORDS = ("nan", "inf", "-1", "0", "1e308", "-1e-308", "9" * 20, "null", "true", "[]", "{}", '""', "é", "%")
+VALUES: tuple[Any, ...] = (
+    None, True, "", "x", -1, 0, 0.5, 1e308, 1 << 70, float("nan"), float("inf"), [], {}, [[]], [1, "x"], {"a": 1},
+)  # fmt: skip
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
@@ -51,3 +56,29 @@ def damaged_text(text: str, rng: random.Random) -> str:
             lines[at] = " ".join(words)
             lines[at] += "" if lines[at].endswith("\n") else "\n"
     return "".join(lines)
+
+
+def damaged_json(text: str, rng: random.Random) -> str:
+    """One to three values, at any depth, exchanged, left out or written twice."""
+    data: Any = json.loads(text)
+    for _ in range(rng.randrange(1, 4)):
+        if rng.random() < 0.05:
+            data = rng.choice(VALUES)
+        parts = [part for part in _inside(data) if part]
+        if not parts:
+            break
+        part = data if data and rng.random() < 0.4 else rng.choice(parts)
+        key = rng.choice(list(part) if isinstance(part, dict) else range(len(part)))
+        if rng.random() < 0.3:
+            del part[key]
+        else:
+            part[key] = rng.choice((*VALUES, [part[key]] * 2))
+    return json.dumps(data)
+
+
+def _inside(data: Any) -> list[Any]:
+    """All lists and mappings in a value, itself among them."""
+    if not isinstance(data, dict | list):
+        return []
+    values: Any = data.values() if isinstance(data, dict) else data  # pyright: ignore[reportUnknownMemberType]
+    return [data, *(part for value in values for part in _inside(value))]

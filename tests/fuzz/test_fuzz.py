@@ -34,8 +34,8 @@ from stereo_sfm.types import Trajectory
 from tests.calib.test_formats import CANNOT, RIGS, target
 from tests.drivers import dataset_folders
 from tests.drivers.test_mcap import _write as write_foreign
-from tests.fuzz import bombs
-from tests.fuzz.mutate import damaged, damaged_text
+from tests.fuzz import bombs, formats
+from tests.fuzz.mutate import damaged, damaged_json, damaged_text
 from tests.log.recordings import fisheye_rig, stereo_images, write_recording
 from tests.maps.maps import small_map
 
@@ -268,14 +268,115 @@ def test_robots(count: int, child: Child, tmp_path: Path) -> None:
     search(count, case, child)
 
 
-@pytest.mark.parametrize("kind", ["recording", "image", "calibration", "map", "configuration"])
-def test_bombs(kind: str, recordings: list[Path], saved_map: Path, child: Child, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    return formats.make_bags(tmp_path_factory.mktemp("bags"))
+
+
+@few_or_many(15, 300)
+def test_bags(count: int, bags: list[Path], child: Child, tmp_path: Path) -> None:
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        source, rng = bags[seed % len(bags)], random.Random(seed)
+        path, name = formats.damaged_copy(source, tmp_path / str(seed), rng)
+        return f"{source.parent.name}, {name}", [["info", str(path)], ["frames", str(path)]]
+
+    search(count, case, child)
+
+
+@few_or_many(8, 160)
+def test_stores(count: int, child: Child, tmp_path: Path) -> None:
+    store = formats.make_store(tmp_path / "store")
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        path, name = formats.damaged_copy(store, tmp_path / str(seed), random.Random(seed), "store.yaml", "keepout.*")
+        words = [["versions", str(path)], ["label", str(path), "aisle 5", "0,0", "1,1"], ["plan", str(path)]]
+        return name, [["map", *some] for some in words]
+
+    search(count, case, child)
+
+
+@few_or_many(12, 240)
+def test_trajectories(count: int, child: Child, tmp_path: Path) -> None:
+    paths = formats.make_trajectories(tmp_path)
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        path, name = formats.damaged_copy(paths[seed % 3], tmp_path / str(seed), random.Random(seed))
+        pair = [str(path), str(paths[seed // 3 % 3])][:: -1 if seed % 2 else 1]
+        align = ("se3", "sim3", "origin", "none")[seed % 4]
+        return name, [["eval", pair[0], "--ref", pair[1], "--align", align]]
+
+    search(count, case, child)
+
+
+@few_or_many(14, 280)
+def test_images_and_masks(count: int, child: Child, tmp_path: Path) -> None:
+    folders = formats.make_image_folders(tmp_path)
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        source = folders[seed % len(folders)]
+        wanted = ("mask.png", "rig.yaml") if (source / "mask.png").exists() else ("*/*",)
+        path, name = formats.damaged_copy(source, tmp_path / str(seed), random.Random(seed), *wanted)
+        return f"{source.name}, {name}", [["frames", str(path)], ["info", str(path)]]
+
+    search(count, case, child)
+
+
+@few_or_many(8, 160)
+def test_recording_folders(count: int, recordings: list[Path], child: Child, tmp_path: Path) -> None:
+    root = formats.make_recordings(tmp_path / "recordings", recordings[0])
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        path, name = formats.damaged_copy(root, tmp_path / str(seed), random.Random(seed))
+        return name, [["recordings", str(path)], ["info", str(next(path.iterdir()))]]
+
+    search(count, case, child)
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return formats.make_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@few_or_many(8, 160)
+def test_runs(count: int, run_folder: Path, child: Child, tmp_path: Path) -> None:
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        names = ("*.json", "*.toml", "*.tum", "*.kitti", "rig.yaml")
+        path, name = formats.damaged_copy(run_folder, tmp_path / str(seed), random.Random(seed), *names)
+        page = ["compare", str(path), str(run_folder), "-o", str(tmp_path / "page")]
+        kitti = str(path / "trajectory_odom.kitti")
+        more = [["eval", str(path)], ["eval", kitti, "--ref", str(run_folder / "trajectory_odom.tum")], page]
+        return name, [["diff", str(path), str(run_folder)], more[seed % 3]]
+
+    search(count, case, child)
+
+
+@few_or_many(8, 160)
+def test_results_of_batches(count: int, run_folder: Path, child: Child, tmp_path: Path) -> None:
+    task = {"ok": True, "recording": "a.mcap", "config": dump(Config())}
+    stats = json.loads((run_folder / "stats.json").read_text())
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        rng, folder = random.Random(seed), tmp_path / str(seed)
+        folder.mkdir()
+        whole = json.dumps({**task, "stats": stats})
+        part = json.dumps({**task, "stats": json.loads(damaged_json(json.dumps(stats), rng))})
+        (folder / "result.json").write_text(part if rng.random() < 0.7 else damaged_json(whole, rng))
+        return "result.json", [["earlier", str(folder)]]
+
+    search(count, case, child)
+
+
+@pytest.mark.parametrize("kind", ["recording", "image", "calibration", "map", "configuration", "bag"])
+def test_bombs(
+    kind: str, recordings: list[Path], saved_map: Path, bags: list[Path], child: Child, tmp_path: Path
+) -> None:
     makers = {
         "recording": lambda: bombs.recordings(tmp_path, recordings),
         "image": lambda: bombs.images(tmp_path),
         "calibration": lambda: bombs.calibrations(tmp_path),
         "map": lambda: bombs.maps(tmp_path, saved_map),
         "configuration": lambda: bombs.configurations(tmp_path),
+        "bag": lambda: formats.bag_bombs(tmp_path, bags[0]),
     }
     wrong = [fault for name, argv in makers[kind]() for fault in check(child, name, argv)]
     assert not wrong, f"{len(wrong)} faults\n" + "\n".join(wrong)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 
-from stereo_sfm.input_file import read_bytes
+from stereo_sfm.input_file import read_bytes, read_yaml
 from stereo_sfm.service.outputs.floor_grid import turned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.types import U8
 
 PICTURE, ABOUT = "height.png", "costmap.yaml"  # both have the same pixels
+MOST_ABOUT = 1 << 16  # bytes
 MOST_PX = 2048  # a side: more takes long on a telephone
 
 
@@ -43,13 +43,13 @@ class SurfacePictures:
                 if written != self._made_of:
                     self._made_of, self._newest = written, None
                     self._newest = self._made(axes, written)
-            except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError, cv2.error):
+            except (OSError, ValueError, LookupError, TypeError, cv2.error):
                 return None
             return self._newest
 
     def _made(self, axes: RobotAxes, written: int) -> SurfacePicture | None:
         image = cv2.imdecode(np.frombuffer(read_bytes(self._folder / PICTURE), np.uint8), cv2.IMREAD_UNCHANGED)
-        about = yaml.safe_load(read_bytes(self._folder / ABOUT))
+        about = read_yaml(self._folder / ABOUT, MOST_ABOUT)
         if image is None or image.ndim != 3 or image.shape[2] != 4:
             return None
         step = -(-max(image.shape[:2]) // MOST_PX)
