@@ -29,8 +29,13 @@ def stamp_from_seconds(text: str) -> int:
         stamp_ns = int(Decimal(text).scaleb(9).to_integral_value())
     except (ArithmeticError, ValueError):
         raise ValueError(f"'{text}' is not a time in seconds") from None
+    return _in_range(stamp_ns, text, "seconds")
+
+
+def _in_range(stamp_ns: int, text: str, unit: str) -> int:
+    """Raises ValueError for a stamp that has no place in 64 bits."""
     if abs(stamp_ns) >= 2**62:
-        raise ValueError(f"'{text}' is too large for a time in seconds")
+        raise ValueError(f"'{text[:30]}' is too large for a time in {unit}")
     return stamp_ns
 
 
@@ -109,7 +114,7 @@ def read_euroc(path: Path) -> Trajectory:
     """
     rows = _rows(path, 8, alone=True)
     try:
-        stamps = [int(r[0]) for r in rows]
+        stamps = [_in_range(int(r[0]), r[0], "nanoseconds") for r in rows]
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
     return _trajectory(path, stamps, [r[1:8] for r in rows], _WXYZ)

@@ -31,8 +31,8 @@ from stereo_sfm.types import F32, F64, U8, U16
 # Parts of the names that encoders go by (libx264, hevc_nvenc) -> FFmpeg's decoder.
 VIDEO = {"264": "h264", "265": "hevc", "hevc": "hevc", "av1": "libdav1d", "vp8": "vp8", "vp9": "vp9"}
 NOTHING = (float("nan"),) * 3  # what is not measured
-# Exceptions of damaged or unexpected messages.
-BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
+# Exceptions of damaged or unexpected messages; LookupError: a topic may have messages of several types.
+BAD_MESSAGE = (ValueError, DecodeError, struct.error, LookupError)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
     Raises:
         StereoSfmError: no images, an unknown topic, or more than two images with ambiguous names.
     """
-    rows = [t for t in reader.topics if t.encoding in ENCODINGS]
+    rows = [t for t in reader.topics if t.topic and t.encoding in ENCODINGS]
     image_topics = [t.topic for t in rows if t.schema in IMAGES]
     if not image_topics:
         raise StereoSfmError(f"{reader.path} contains no images ({_content(reader.topics)})")

@@ -88,7 +88,7 @@ class BagReader:
             check_bag(self.path)
             reader = rosbag1.Reader(self.path) if self._ros_1 else rosbag2.Reader(self.path)
             reader.open()
-            _check_numbers(reader)
+            _check_index(reader)
             if self._ros_1:
                 limit_chunks(reader)
             else:
@@ -169,8 +169,10 @@ class BagReader:
         return Channel(connection.id, connection.topic, "cdr", {}, connection.id), schema
 
 
-def _check_numbers(reader: Any) -> None:
-    """Raises ValueError for counts and times that are no numbers, as they stand in a text."""
+def _check_index(reader: Any) -> None:
+    """Raises ValueError for names that are no texts, and counts and times that are no numbers."""
+    if not all(isinstance(name, str) for c in reader.connections for name in (c.topic, c.msgtype)):
+        raise ValueError("a name or a type of its topics is not a text")
     numbers: list[Any] = [reader.start_time, reader.end_time, *(c.msgcount for c in reader.connections)]
     if not all(isinstance(n, int) and abs(n) < 1 << 63 for n in numbers):
         raise ValueError("a count or a time of its metadata is not a number")

@@ -9,13 +9,17 @@ import sqlite3
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.cli import main
+from stereo_sfm.config import Config, dump
 from stereo_sfm.drivers import open_source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.batch import BatchTask, finished, table_row
+from stereo_sfm.eval.compare import stats_of
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.writer import LogWriter
@@ -140,6 +144,58 @@ def test_a_bag_that_is_a_pipe(suffix: str, tmp_path: Path, capsys: pytest.Captur
     os.mkfifo(pipe)
     _one_line(capsys, ["info", f"rosbag:{pipe}"], "it is not a file")
     _one_line(capsys, ["info", str(pipe)], "not a known kind")
+
+
+_STATS: dict[str, Any] = {
+    **dict.fromkeys(("frames", "lost_percent", "keyframes", "loops_accepted", "path_m", "frames_per_s"), 1.0),
+    "dropped": 0, "pieces": 1, "fingerprint": "x", "lost_intervals": [], "calibration": [{"text": "x"}],
+    "ms": {"track": {"p50": 1.0}}, "evaluation": {"map": {"ape_m": {"rmse": 0.1}}},
+}  # fmt: skip
+
+
+def _results(folder: Path, stats: Any) -> tuple[Any, Any]:
+    """What `compare` and a batch that goes on read."""
+    task = BatchTask("a.mcap", str(folder), Config(), False)
+    result = {"ok": True, "recording": task.spec, "config": dump(task.config), "stats": stats}
+    (folder / "stats.json").write_text(json.dumps(stats))
+    (folder / "result.json").write_text(json.dumps(result))
+    try:
+        return stats_of(folder), finished(task)
+    except StereoSfmError as error:
+        return str(error), finished(task)
+
+
+def test_numbers_of_a_run(tmp_path: Path) -> None:
+    stats, result = _results(tmp_path, _STATS)
+    assert stats == _STATS and table_row("a", result)[-1] == "x"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("frames", "x"), ("frames", 1 << 70), ("path_m", None), ("ms", []), ("ms", {"track": 5.0}), ("pieces", {}),
+        ("lost_intervals", 3), ("calibration", [1]), ("fingerprint", 7), ("evaluation", {"map": {}}),
+    ],
+)  # fmt: skip
+def test_numbers_of_a_run_that_no_run_wrote(name: str, value: object, tmp_path: Path) -> None:
+    for stats in ({**_STATS, name: value}, {key: v for key, v in _STATS.items() if key != name}, [value]):
+        said, result = _results(tmp_path, stats)
+        assert said == f"{tmp_path} is not the folder of a run: its stats.json cannot be read" and result is None
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("1403636579763555584,1e308,0,0,1,0,0,0", "beyond 1e"),
+        ("1e9 0 0 0 0 0 0 1e300", "beyond 1e"),
+        ("1 0 0 -1e200 0 1 0 0 0 0 1 0", "beyond 1e"),
+        (f"{1 << 62},0,0,0,1,0,0,0", "too large for a time"),
+        (f"{1 << 62} 0 0 0 0 0 0 1", "too large for a time"),
+    ],
+)
+def test_poses_that_nothing_has(line: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "path.txt").write_text(f"{line}\n{line}\n")
+    _one_line(capsys, ["eval", str(tmp_path / "path.txt"), "--ref", str(tmp_path / "path.txt")], "path.txt", says)
 
 
 @pytest.mark.parametrize("noise", [1e308, 1e-300, 0.0, float("nan")])
