@@ -2,9 +2,11 @@
 
     python -m benchmarks attack -- [--only WORD] [--requests N] [--busy N]
 
-A service plays the bundled recording with the page, Foxglove and the pose socket on. Each attack is carried out for
-real and its row says what happened; between two attacks a client with the token must still get poses. Files are given
-to commands in processes of their own. The exit code is the number of attacks that found something open.
+A service continues a saved map and plays the bundled recording with the page, Foxglove and the pose socket on. Each
+attack is carried out for real and its row says what happened; between two attacks a client with the token must still
+get poses. Files are given to commands in processes of their own. What no client of a running service can show is shown
+by other benchmarks and by tests, after it. The exit code is the number of rows that are not closed: what was open, and
+what was not run because its tests are skipped here.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import http.client
 import json
 import os
 import random
+import re
 import resource
 import signal
 import socket
@@ -22,7 +25,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -31,6 +34,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
+from stereo_sfm.service.outputs.door import UNREAD_S
 from tests.service.hostile import frames, request, status
 
 START_S = 600.0  # for the service to have a pose: kernels may be compiled, and the computer may be busy
@@ -39,6 +43,10 @@ MOST_MB = 600  # of a command that reads a hostile file
 HANG_S = 300.0  # by the clock: the computer may be busy, and a command has fifty seconds of processor time
 BEARER = "Bearer "
 TRACEBACK, MOST_SHOWN = "Traceback", 4000  # characters of one
+NOT_RUN, ALL_SKIPPED = "not run", 5  # pytest's exit code when a file is skipped whole, or holds no test
+FULL_S = 10.0  # in which poses fill the buffer of a client that reads nothing; a busy computer has fewer poses a second
+OUT_S = UNREAD_S + FULL_S  # that who has the token may be kept out by others who have it and read nothing
+WATCHED_S = 30.0  # while somebody is kept out
 DEMO = ROOT / "recordings" / "demo.mcap"
 
 WRITER = """
@@ -190,9 +198,18 @@ def clients_that_never_read(t: Target) -> Outcome:
             client.connect(("127.0.0.1", t.poses))
             client.sendall(t.token.encode() + b"\n")
             held.enter_context(client)
-        time.sleep(5.0)  # until they have all places
-        seconds = t.pose_within(60)
-    return f"another one has a pose after {seconds:.1f} s", seconds < 60
+        seconds = longest_wait(t, WATCHED_S)
+    why = f"a buffer is full within {FULL_S:.0f} s, who then reads nothing is dropped after {UNREAD_S:.0f} s"
+    return f"another one is kept out for {seconds:.1f} s at most, allowed are {OUT_S:.0f}: {why}", seconds <= OUT_S
+
+
+def longest_wait(t: Target, watched_s: float) -> float:
+    """The longest that a new client with the token waited for a pose, of one after the other."""
+    until, waits = time.monotonic() + watched_s, [0.0]
+    while time.monotonic() < until:
+        waits.append(t.pose_within(2 * OUT_S))
+        time.sleep(0.2)
+    return max(waits)
 
 
 def guesses(t: Target) -> Outcome:
@@ -293,7 +310,7 @@ def hostile_files(t: Target) -> Outcome:
 
 
 def many_saves(t: Target) -> Outcome:
-    """the map is saved by four clients again and again"""
+    """the joined map is saved by four clients again and again"""
     given = {"Content_Type": "application/json", "X_Stereo_Sfm": "1", "Authorization": BEARER + t.token}
 
     def save(_: int) -> tuple[float, bool, str]:
@@ -305,8 +322,18 @@ def many_saves(t: Target) -> Outcome:
     with ThreadPoolExecutor(4) as pool:
         replies = list(pool.map(save, range(16)))
     saved, others = sum(ok for _, ok, _ in replies), sorted({text for _, ok, text in replies if not ok})
-    slowest = max(seconds for seconds, _, _ in replies)
-    return f"{saved} of {len(replies)} saved, the slowest in {slowest:.1f} s {' '.join(others)}", not others
+    slowest, joined = max(seconds for seconds, _, _ in replies), sessions(t.folder / "store")
+    text = f"{saved} of {len(replies)} saved, the slowest in {slowest:.1f} s, {joined} sessions in the map"
+    return " ".join([text, *others]), not others and joined > 1
+
+
+def sessions(store: Path) -> int:
+    """Sessions of a saved map, which a service may be replacing; 0 without one."""
+    for _ in range(20):
+        with suppress(OSError, ValueError):
+            return json.loads((store / "map.json").read_text())["sessions"]
+        time.sleep(0.1)
+    return 0
 
 
 def group_signal(t: Target) -> Outcome:
@@ -385,19 +412,104 @@ def _group(leader: int) -> list[int]:
     return found
 
 
-ATTACKS: tuple[Callable[[Target], Outcome], ...] = (
-    foreign_page, without_a_token, a_link_twice, idle_connections, silent_connections, slow_handshakes,
-    clients_that_never_read, guesses, hostile_requests, a_map_over_recordings, files_of_others, two_writers,
-    hostile_files, many_saves, group_signal, stopped_processes,
+ATTACKS: tuple[tuple[int, Callable[[Target], Outcome]], ...] = (
+    (1, foreign_page), (2, without_a_token), (2, a_link_twice), (3, idle_connections), (3, silent_connections),
+    (3, slow_handshakes), (3, clients_that_never_read), (3, guesses), (4, hostile_requests),
+    (14, a_map_over_recordings), (2, files_of_others), (6, two_writers), (14, hostile_files), (7, many_saves),
+    (9, group_signal), (9, stopped_processes),
+)  # fmt: skip
+# Numbers are those of the list of what was open once. The tables below have what no client of a running service shows.
+
+PROGRAMS = (
+    (7, "processor time of a save that joins a session", "benchmarks/_saves.py"),
+    (7, "SIGTERM beside busy loops", "benchmarks/ends.py --count 3 --busy 8"),
+    (8, "stages are killed beside busy loops", "benchmarks/kills.py --count 5 --busy 8"),
+    (15, "python -m benchmarks --help", "-m benchmarks --help"),
+    (18, "the documentation cannot be built", "-m mkdocs build --strict -q -d {folder}/site"),
+)
+
+TESTED = (
+    (4, "pages and sockets are given anything", "service/test_hostile_requests.py"),
+    (5, "DDS listens on every network and nothing says so", "service/test_page.py::test_what_is_open_is_listed"),
+    (6, "a file that is being written is replaced", "log/test_whole_file.py"),
+    (10, "the folder of recordings is deleted, the disk is full", """
+        recording/test_segments.py::test_a_folder_that_is_deleted_is_made_again
+        recording/test_segments.py::test_the_reason_of_a_disk_that_refuses_is_a_sentence
+        recording/test_segments.py::test_a_full_disk_costs_images_and_no_pose
+        recording/test_segments.py::test_marks_of_the_service_age_and_leave_room"""),
+    (11, "an output leaves shared memory",
+     "service/test_stop.py::test_libraries_of_an_output_clean_up_at_its_end_if_they_do_that_in_time"),
+    (12, "a tilted camera's pose climbs on a flat floor", "service/test_robot_mounting.py"),
+    (13, "poses age where a source cannot keep its rate", """
+        service/test_parts.py::test_a_recording_that_is_slower_than_its_stamps_does_not_age
+        service/test_parts.py::test_the_sensors_clock_is_that_of_the_fastest_image
+        service/test_parts.py::test_a_camera_that_does_not_keep_its_rate_does_not_age"""),
+    (14, "hostile files are read", "commands/test_hostile_files.py test_input_files.py"),
+    (14, "mutated files of every format are read", "fuzz"),
+    (15, "a source or a folder is not what everybody types", """
+        service/test_page.py::test_a_source_is_an_argument_of_serve
+        commands/test_bad_input.py::test_a_folder_named_like_a_kind_is_the_folder"""),
+    (16, "a slow source or a busy computer is a loss", """
+        service/test_parts.py::test_a_slow_source_and_a_busy_computer_are_no_loss
+        service/test_parts.py::test_the_most_severe_problem_is_the_state
+        recording/test_segments.py::test_marks_keep_what_lies_around"""),
+    (17, "missing pairs change a right calibration", "pipeline/test_missing_pairs.py"),
+    (19, "two runs are not compared", "eval/test_reports.py::test_two_runs_differ_as_a_table"),
+    (20, "info finds no problem where there is one", """
+        commands/test_first_day.py::test_info_finds_an_inverted_extrinsic
+        commands/test_first_day.py::test_info_finds_damaged_images
+        commands/test_first_day.py::test_info_lists_what_readers_warn_about
+        commands/test_first_day.py::test_info_says_that_the_baseline_is_not_checked"""),
+    (21, "a mistyped folder is taken for a camera", """
+        commands/test_first_day.py::test_a_mistyped_folder_is_named_once
+        commands/test_bad_input.py::test_a_mistyped_folder_is_no_camera"""),
+    (22, "a report begins with compiling and no verdict", """
+        eval/test_reports.py::test_a_report_begins_with_one_sentence_and_the_picture
+        eval/test_reports.py::test_pass_is_more_than_poses
+        eval/test_reports.py::test_compiling_is_no_time_of_a_stage"""),
+    (23, "words on the screen are in no document", """
+        commands/test_first_day.py::test_terms_on_the_screen_are_in_the_glossary
+        commands/test_first_day.py::test_equations_of_a_thesis_are_no_row_of_eval
+        drivers/test_registry.py::test_options_of_the_simulated_t265_are_not_the_cameras"""),
+    (24, "programs cannot read the tables of batch", """
+        eval/test_batch.py::test_names_are_unique
+        eval/test_batch.py::test_every_column_is_documented
+        eval/test_reports.py::test_tables_have_empty_cells_for_what_is_missing"""),
+    (25, "messages of the service do not help", """
+        service/test_commands.py service/test_link.py::test_a_taken_port_is_tried_again
+        commands/test_first_day.py::test_a_full_disk_names_the_settings_that_help
+        maps/test_update.py::test_labels_and_plans_while_a_service_extends_the_map
+        test_examples.py"""),
+    (26, "a point that is seen once spoils a COLMAP export",
+     "export/test_exports.py::test_a_point_that_is_seen_once_is_left_out"),
+    (27, "faults while something else runs", "service/test_service_faults.py service/test_soak.py"),
 )  # fmt: skip
 
-TESTED = {  # what no client of a service that runs can show
-    "an output leaves shared memory": "tests/service/test_stop.py -k tidy",
-    "a tilted camera's pose climbs on a flat floor": "tests/service/test_robot_mounting.py",
-    "missing pairs change a right calibration": "tests/pipeline/test_missing_pairs.py",
-    "info finds no problem with an inverted extrinsic": "tests/commands/test_first_day.py -k inverted",
-    "a point that is seen once spoils a COLMAP export": "tests/export/test_exports.py -k seen_once",
-}
+
+def pytest_said(code: int, said: str) -> Outcome:
+    """What tests show, by exit code and output of `pytest -rs`: a skipped one shows nothing, with exit code 0."""
+    skipped = sorted(set(re.findall(r"^SKIPPED \[\d+\] [^ ]+ (.*)", said, re.M)))
+    if code not in (0, ALL_SKIPPED):
+        return said[-MOST_SHOWN:], False
+    summary = said.strip().splitlines()[-1]
+    return (f"{NOT_RUN}: skipped ({'; '.join(skipped)}); {summary}", False) if skipped else (summary, not code)
+
+
+def run_tests(tests: str) -> Outcome:
+    """Places in tests/, with spaces between them; slow ones, too."""
+    places = [f"tests/{place}" for place in tests.split()]
+    command = [sys.executable, "-m", "pytest", "-rs", "-n", "0", "-m", "", *places]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return pytest_said(run.returncode, run.stderr + run.stdout)
+
+
+def run_program(arguments: str) -> Outcome:
+    """Another program of ours, which is closed by its exit code; of its output, the lines that are not indented."""
+    with tempfile.TemporaryDirectory(prefix="attack") as folder:
+        command = [sys.executable, *(word.format(folder=folder) for word in arguments.split())]
+        run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    said = [line for line in run.stdout.splitlines() if line and not line.startswith(" ")]
+    return "; ".join(said[-3:]) if not run.returncode else (run.stdout + run.stderr)[-MOST_SHOWN:], not run.returncode
 
 
 # -- the service -------------------------------------------------------------------------------------------------------
@@ -454,47 +566,79 @@ def running(requests: int, folder: Path | None = None) -> Generator[Target]:
                 Path(log.name).unlink()
 
 
-def main() -> int:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", default="", metavar="WORD", help="attacks whose name has this word")
-    parser.add_argument("--requests", type=int, default=2000, metavar="N", help="hostile requests")
-    parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside it")
-    args = parser.parse_args()
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup a service would ignore it, as it should
-    rows: list[tuple[str, str, bool]] = []
+def first_map(store: Path) -> None:
+    """Save a map of the bundled recording, which a service then continues; as the service does it, not for others."""
+    with tempfile.TemporaryDirectory(prefix="attack") as name:
+        command = [sys.executable, "-m", "stereo_sfm.cli", "run", str(DEMO), "-q", "--log", "none", "-o", f"{name}/run"]
+        command += ["--map-out", str(store)]
+        subprocess.run(command, env=_environment(Path(name)), stdout=subprocess.DEVNULL, check=True, umask=0o027)
 
-    def report(name: str, what: str, closed: bool) -> None:
-        rows.append((name, what, closed))
-        print(f"{name:58}  {'closed' if closed else 'OPEN':6}  {what}", flush=True)
 
-    with ExitStack() as beside, running(args.requests) as target:
-        for _ in range(args.busy):
+class Table:
+    """Rows are printed as they come."""
+
+    def __init__(self) -> None:
+        self.open = 0  # rows that are not closed
+
+    def row(self, item: int, name: str, what: str, closed: bool) -> None:
+        """Args: item, its number in the list. what, happened."""
+        self.open += not closed
+        state = "closed" if closed else NOT_RUN if what.startswith(NOT_RUN) else "OPEN"
+        print(f"{item:3}  {name:58}  {state:7}  {what}", flush=True)
+
+
+def attack_a_service(
+    table: Table, attacks: Sequence[tuple[int, Callable[[Target], Outcome]]], requests: int, busy: int
+) -> None:
+    """Carry out attacks on a service that continues a saved map; then it is ended."""
+    with ExitStack() as beside:
+        folder = Path(beside.enter_context(tempfile.TemporaryDirectory(prefix="attack"))) / "service"
+        folder.mkdir()
+        first_map(folder / "store")
+        target = beside.enter_context(running(requests, folder))
+        for _ in range(busy):
             loop = subprocess.Popen([sys.executable, "-c", "while True: pass"])
             beside.callback(loop.kill)
-        for attack in ATTACKS:
-            name = (attack.__doc__ or attack.__name__).strip()
-            if args.only in name:
-                report(name, *attack(target))
-                if (seconds := target.pose_within(30)) > 10:
-                    report("  afterwards", f"the next client has a pose after {seconds:.0f} s", False)
+        for item, attack in attacks:
+            table.row(item, named(attack), *attack(target))
+            if (seconds := target.pose_within(30)) > 10:
+                table.row(item, "  afterwards", f"the next client has a pose after {seconds:.0f} s", False)
         begin = time.monotonic()
         target.process.send_signal(signal.SIGTERM)
         with suppress(subprocess.TimeoutExpired):
             target.process.wait(3 * STOP_S)
-        seconds = time.monotonic() - begin
-        saved = (target.folder / "store" / "map.json").exists()
-        report("SIGTERM afterwards", f"{seconds:.1f} s, map saved: {saved}", seconds <= STOP_S and saved)
+        seconds, count = time.monotonic() - begin, sessions(folder / "store")
+        table.row(7, "SIGTERM afterwards", f"{seconds:.1f} s, {count} sessions in the saved map",
+                  seconds <= STOP_S and count > 1)  # fmt: skip
     found = target.said.count(TRACEBACK)
-    report("the service's log", f"{found} tracebacks", not found)
+    table.row(4, "the service's log", f"{found} tracebacks", not found)
     for text in target.said.split(TRACEBACK)[1:]:
         print(f"{TRACEBACK}{text[:MOST_SHOWN]}")
-    for name, test in TESTED.items():
-        if args.only in name:
-            command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-m", "", *test.split()]
-            run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-            report(name, test if run.returncode == 0 else run.stdout[-MOST_SHOWN:], run.returncode == 0)
-    return sum(not closed for _, _, closed in rows)
+
+
+def named(attack: Callable[[Target], Outcome]) -> str:
+    """Its name in the table."""
+    return (attack.__doc__ or attack.__name__).strip()
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", metavar="WORD", help="rows whose name has this word")
+    parser.add_argument("--requests", type=int, default=2000, metavar="N", help="hostile requests")
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="busy loops beside the service")
+    args = parser.parse_args()
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # under nohup a service would ignore it, as it should
+    table = Table()
+    attacks = [(item, attack) for item, attack in ATTACKS if args.only in named(attack)]
+    if attacks:
+        attack_a_service(table, attacks, args.requests, args.busy)
+    for rows, run in ((PROGRAMS, run_program), (TESTED, run_tests)):
+        for item, name, what in rows:
+            if args.only in name:
+                table.row(item, name, *run(what))
+    print(f"{table.open} rows are not closed")
+    return table.open
 
 
 if __name__ == "__main__":

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from stereo_sfm.config import load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval import batch
 
+ROOT = Path(__file__).parents[2]
 SMALL = "sim:aisle?size=212x200&frames=12&rate=15&seed={}"
 
 
@@ -27,6 +30,27 @@ def test_names_are_unique() -> None:
     assert batch.names(["sim:loop?size=424x400&seed=1", "sim:loop?seed=2", "tour 2.mcap"]) == [
         "sim_loop_size_424x400_seed_1", "sim_loop_seed_2", "tour_2",
     ]  # fmt: skip
+
+
+def test_every_column_is_documented() -> None:
+    rows = [line for line in (ROOT / "docs" / "tasks" / "batch.md").read_text().splitlines() if line.startswith("| `")]
+    assert tuple(name for row in rows for name in re.findall(r"`([^`]+)`", row.split("|")[1])) == batch.COLUMNS
+
+
+def test_a_missing_value_is_a_dash_empty_or_null(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    good = ["a", 12, 100.0, 3, 0, 1.5, 2.5, 30.0, "0123abcd"]
+    batch.write_results([good, batch.table_row("b", {"ok": False, "error": "line\nno images"})], tmp_path)
+    assert "| b | - | - | - | - | - | - | - | failed: no images |" in (tmp_path / "results.md").read_text()
+    assert list(rows(tmp_path)[1].values()) == ["b", *[""] * 7, "failed: no images"]
+    columns = parquet.read_table(tmp_path / "results.parquet").to_pydict()
+    assert tuple(columns) == batch.COLUMNS
+    assert columns["frames"] == [12, None] and columns["ATE mm"] == [2.5, None]
+
+
+def test_the_extra_brings_what_the_table_needs() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(extras["table"]) < set(extras["batch"])
 
 
 def test_a_result_of_another_configuration_is_not_reused(tmp_path: Path) -> None:

@@ -114,6 +114,20 @@ def _plan() -> tuple[U8, float, tuple[float, float]]:
     return image, 0.05, (-0.8, -1.5)
 
 
+def _press(browser: Browser, key: str, code: str, text: str = "") -> None:
+    """A key on what has the focus, with what the browser itself does then."""
+    browser.call("Input.dispatchKeyEvent", type="keyDown", key=key, code=code, text=text)
+    browser.call("Input.dispatchKeyEvent", type="keyUp", key=key, code=code)
+
+
+def _touch(browser: Browser, steps: list[list[tuple[int, int]]]) -> None:
+    """Fingers go through these places together."""
+    for k, places in enumerate(steps):
+        points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
+        browser.call("Input.dispatchTouchEvent", type="touchMove" if k else "touchStart", touchPoints=points)
+    browser.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+
 # -- in a browser ------------------------------------------------------------------------------------------------------
 
 
@@ -436,9 +450,52 @@ def test_an_operator_plays_a_recording_by_keyboard_in_the_dark(width: int, heigh
         assert "light dark" in browser.run(dark) and browser.run("matchMedia('(prefers-color-scheme: dark)').matches")
         assert browser.run("document.documentElement.scrollWidth") <= width
         browser.screenshot(tmp_path / "player.png")
-        browser.run("document.getElementById('close').click()")
+        browser.run("pause(); document.getElementById('close').focus()")
+        _press(browser, " ", "Space", " ")
         browser.until("!document.getElementById('player').open && !played.timer")
         browser.screenshot(tmp_path / "dark.png")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_finger_scrolls_the_page_and_two_move_and_zoom_the_map() -> None:
+    with _serving() as output, Browser(390, 844) as browser:
+        browser.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+        _show(output, 1)
+        browser.go(f"http://127.0.0.1:{output.port}/")
+        browser.until("map.points.length && (redraw(), view.cx !== undefined)")
+        box = "document.getElementById('plan').getBoundingClientRect()"
+        x, y = (round(v) for v in browser.run(f"(b => [b.x + b.width / 2, b.y + b.height / 2])({box})"))
+        _touch(browser, [[(x - 20 - 5 * k, y), (x + 20 + 5 * k, y)] for k in range(9)])
+        browser.until("Math.abs(view.zoom - 3) < 0.01")
+        zoom, cx, cy = browser.run("[view.zoom, view.cx, view.cy]")
+        _touch(browser, [[(x, y + 10 * k), (x + 40, y + 10 * k)] for k in range(7)])
+        browser.until(f"Math.abs(view.cx - {cx} - 60 / view.scale) < 0.01 && Math.abs(view.cy - {cy}) < 0.01")
+        assert browser.run("view.zoom") == pytest.approx(zoom)
+        assert browser.run("visualViewport.scale === 1 && scrollY === 0")
+        before = browser.run("[view.zoom, view.cx, view.cy]")
+        _touch(browser, [[(x, y - 10 * k)] for k in range(11)])
+        browser.until("scrollY > 30")
+        assert browser.run("[view.zoom, view.cx, view.cy]") == before
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_arrow_keys_move_the_map_and_a_reload_keeps_the_plots() -> None:
+    with _serving() as output, Browser(1440, 900) as browser:
+        address = f"http://127.0.0.1:{output.port}/"
+        _show(output, 1)
+        browser.go(address)
+        browser.until("map.points.length && (redraw(), view.cx !== undefined) && history_.length > 2")
+        cx, cy = browser.run("document.getElementById('plan').focus(), [view.cx, view.cy]")
+        _press(browser, "ArrowUp", "ArrowUp")
+        browser.until(f"view.cx > {cx} && view.cy === {cy} && scrollY === 0")
+        _press(browser, "ArrowRight", "ArrowRight")
+        browser.until(f"view.cy < {cy}")
+        _press(browser, "0", "Digit0", "0")
+        browser.until(f"view.x === null && view.cx === {cx}")
+        first = browser.run("history_[0].at")
+        browser.call("Page.reload")
+        browser.until(f"document.readyState === 'complete' && history_.length > 3 && history_[0].at === {first}")
+        assert browser.run("document.querySelectorAll('#history svg path').length") == 4
 
 
 def test_commands_of_other_sites_and_too_large_ones_are_refused() -> None:

@@ -5,8 +5,13 @@ const number = (value, digits = 1) => value === null || value === undefined ? "â
 const STATES = { running: "good", starting: "warn", lost: "bad", camera_gone: "bad", disk_full: "warn", stopping: "warn" };
 let plan = null, planVersion = 0, surface = null;  // pictures under the map
 const view = { zoom: 1, x: null, y: null, follow: false, scale: 1 };  // of the plan; centre null: the whole map
-const HISTORY_S = 300, history_ = [];  // what the small plots show, one entry a second
+const HISTORY_S = 300, history_ = kept();  // what the small plots show, one entry a second
 let live = null, map = { version: 0, points: [], path: [] }, last = null, receivedAt = 0, commands = 0;
+
+function kept() {  // by the tab, from before it was loaded again
+  onpagehide = () => sessionStorage.setItem("history", JSON.stringify(history_));
+  try { return JSON.parse(sessionStorage.getItem("history")) || []; } catch { return []; }
+}
 
 async function request(path, options) {
   const response = await fetch(path, options);
@@ -141,9 +146,31 @@ function drawPlan(state) {
 
 function redraw() { if (last) drawPlan(last); }
 
+const zoomed = (factor) => Math.max(0.5, Math.min(40, view.zoom * factor));
+
 function zoom(factor) {
-  view.zoom = Math.max(0.5, Math.min(40, view.zoom * factor));
+  view.zoom = zoomed(factor);
   redraw();
+}
+
+function move([fromX, fromY], [toX, toY], factor = 1) {  // pixels: what lies at the one comes to the other
+  if (view.cx === undefined) return;
+  const { clientWidth: width, clientHeight: height } = $("plan"), scale = view.scale * zoomed(factor) / view.zoom;
+  view.x = view.cx - (fromY - height / 2) / view.scale + (toY - height / 2) / scale;
+  view.y = view.cy - (fromX - width / 2) / view.scale + (toX - width / 2) / scale;
+  view.zoom = zoomed(factor);
+  follow(false);
+}
+
+const ARROW_PX = 40, ARROWS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [1, 0], ArrowRight: [-1, 0] };
+const fingers = new Map();  // those on the plan, by pointer: one scrolls the page, two move and zoom the plan
+const span = ([a, b]) => ({ at: [(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], size: Math.hypot(a[0] - b[0], a[1] - b[1]) });
+
+function fingerMoved(event) {
+  const before = span([...fingers.values()]);
+  fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
+  const now = span([...fingers.values()]);
+  move(before.at, now.at, now.size / Math.max(before.size, 1));
 }
 
 function follow(on) {
@@ -160,11 +187,20 @@ function wholeMap() {
 function prepareView() {
   const canvas = $("plan");
   canvas.onwheel = (event) => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2); };
-  canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
+  canvas.onpointerdown = (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    if (event.pointerType === "touch") fingers.set(event.pointerId, [event.offsetX, event.offsetY]);
+  };
   canvas.onpointermove = (event) => {
-    if (!event.buttons || view.cx === undefined) return;
-    [view.x, view.y] = [view.cx + event.movementY / view.scale, view.cy + event.movementX / view.scale];
-    follow(false);
+    if (event.pointerType !== "touch") { if (event.buttons) move([0, 0], [event.movementX, event.movementY]); }
+    else if (fingers.size === 2 && fingers.has(event.pointerId)) fingerMoved(event);
+  };
+  canvas.onpointerup = canvas.onpointercancel = (event) => fingers.delete(event.pointerId);
+  canvas.addEventListener("touchmove", (event) => event.touches.length > 1 && event.preventDefault(), { passive: false });
+  canvas.onkeydown = (event) => {
+    if (!Object.hasOwn(ARROWS, event.key) || event.ctrlKey || event.altKey || event.metaKey) return;
+    event.preventDefault();
+    move([0, 0], ARROWS[event.key].map((way) => way * ARROW_PX));
   };
   $("zoom-in").onclick = () => zoom(1.5);
   $("zoom-out").onclick = () => zoom(1 / 1.5);
@@ -172,15 +208,15 @@ function prepareView() {
   $("follow").onchange = () => follow($("follow").checked);
 }
 
-function plot(name, values, text) {
+function plot(name, key, text) {
   const figure = document.createElement("figure"), caption = document.createElement("figcaption");
   caption.textContent = `${name}: ${text}`;
-  const most = Math.max(...values, 1e-9), place = "http://www.w3.org/2000/svg";
+  const most = Math.max(...history_.map((entry) => entry[key]), 1e-9), place = "http://www.w3.org/2000/svg";
   const svg = document.createElementNS(place, "svg"), path = document.createElementNS(place, "path");
   svg.setAttribute("viewBox", `0 0 ${HISTORY_S} 100`);
   svg.setAttribute("preserveAspectRatio", "none");
-  const first = HISTORY_S - values.length;
-  path.setAttribute("d", values.map((v, k) => `${k ? "L" : "M"}${first + k} ${96 - 92 * v / most}`).join(""));
+  const from = history_[history_.length - 1].at - HISTORY_S;
+  path.setAttribute("d", history_.map((e, k) => `${k ? "L" : "M"}${e.at - from} ${96 - 92 * e[key] / most}`).join(""));
   svg.append(path);
   figure.append(caption, svg);
   return figure;
@@ -191,11 +227,10 @@ function showHistory(state) {
   if (!h || (history_.length && history_[history_.length - 1].at === now)) return;
   const dropped = Object.values(h.dropped).reduce((a, b) => a + b, 0), speed = state.pose ? state.pose.speed || 0 : 0;
   history_.push({ at: now, rate: h.rate_hz || 0, latency: h.latency_ms[1] || 0, dropped, speed });
-  if (history_.length > HISTORY_S) history_.shift();
-  const of = (key) => history_.map((entry) => entry[key]);
+  while (history_[0].at <= now - HISTORY_S) history_.shift();
   $("history").replaceChildren(
-    plot("Rate", of("rate"), `${number(h.rate_hz)} Hz`), plot("Latency, 95 %", of("latency"), `${number(h.latency_ms[1], 0)} ms`),
-    plot("Dropped images", of("dropped"), String(dropped)), plot("Speed", of("speed"), `${number(speed, 2)} m/s`));
+    plot("Rate", "rate", `${number(h.rate_hz)} Hz`), plot("Latency, 95 %", "latency", `${number(h.latency_ms[1], 0)} ms`),
+    plot("Dropped images", "dropped", String(dropped)), plot("Speed", "speed", `${number(speed, 2)} m/s`));
 }
 
 const KEYS = { "+": () => zoom(1.5), "-": () => zoom(1 / 1.5), "0": wholeMap, f: () => follow(!view.follow),
@@ -279,6 +314,7 @@ function preparePlayer() {
   $("player").onclose = pause;
   $("player").onkeydown = (event) => {
     if (event.target.tagName === "SELECT" || event.key === "Escape") return;
+    if (event.target.tagName === "BUTTON" && event.key === " ") return;  // the space bar is a click on it
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     if (event.key === " ") playOrPause(); else if (step) { pause(); showFrame(played.at + step); } else return;
     event.preventDefault();
