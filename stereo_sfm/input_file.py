@@ -18,7 +18,8 @@ from stereo_sfm.errors import StereoSfmError
 
 MOST_TEXT = 1 << 30  # bytes of a text: a trajectory of a day at 30 Hz has some 200 MB
 MOST_BYTES = 2 << 30  # of any file that is read as a whole
-MOST_JSON = 64 << 20  # bytes: the numbers of a run of a day have one
+MOST_JSON = 64 << 20  # bytes; the numbers of a short run take some kilobytes
+MOST_YAML = 1 << 16  # bytes of what describes one picture
 MOST_DEPTH = 32  # of YAML
 MOST_VALUES = 1_000_000  # of YAML, with every alias written out
 MOST_CHARS = 1 << 16  # of one value of YAML
@@ -97,7 +98,7 @@ def read_json(path: Path, most: int = MOST_JSON) -> Any:
         raise ValueError("nested too deeply") from None
 
 
-def read_yaml(path: Path, most: int) -> Any:
+def read_yaml(path: Path, most: int = MOST_YAML) -> Any:
     """The value in a file.
 
     Args:

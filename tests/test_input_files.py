@@ -121,7 +121,7 @@ def test_a_refused_file_is_both_kinds_of_error(tmp_path: Path) -> None:
     assert str(pickle.loads(pickle.dumps(error.value))) == str(error.value)
 
 
-def test_json_that_is_nested_for_ever(tmp_path: Path) -> None:
+def test_json_that_is_nested_too_deeply(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("[" * 100_000)
     with pytest.raises(ValueError, match="nested too deeply"):
         read_json(tmp_path / "a.json")

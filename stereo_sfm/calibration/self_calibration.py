@@ -35,6 +35,7 @@ KEYFRAMES = 4  # of one window, the last one may have one less; a rotation that 
 # Share of the image's width that common points move (median) between keyframes of a window: less says little.
 MIN_MOTION = 0.02
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case: near ones left the view
+MIN_WINDOWS = 2  # before the first correction: one for each half
 # Windows that each term needs, in the order in which cameras err: rotation, baseline and focal length, decentering.
 INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
 # For halves of two windows each, twice as many for drift, of which two are unknown. As many as there are, but no more
@@ -87,7 +88,7 @@ class SelfCalibration:
         self._since = 0  # first keyframe of the windows
         self._stamp_ns = 0  # newest keyframe
         self._revised_ns = 0  # newest keyframe of the last revision
-        self._until_due = 2  # windows until the next revision, before the first one for each half
+        self._until_due = MIN_WINDOWS  # windows until the next revision
         self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
         self._turn: F64 = np.zeros(3)  # that the tracker noticed
         self._turned_kf_id = -1  # first keyframe since; -1: the rig has been corrected
@@ -131,7 +132,7 @@ class SelfCalibration:
         """After the last keyframe: a last revision from all windows."""
         if len(self._keyframes) >= KEYFRAMES - 1:
             self._close_window()
-        return self._revise(refined_sigmas=0.0) if len(self.windows) >= 2 else None
+        return self._revise(refined_sigmas=0.0) if len(self.windows) >= MIN_WINDOWS else None
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""

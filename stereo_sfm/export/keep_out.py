@@ -18,7 +18,6 @@ from stereo_sfm.pixels import decode
 from stereo_sfm.types import U8, Bool
 
 DRAWING, ABOUT, MASK = "keepout.png", "keepout.yaml", "keepout_mask"
-MOST_ABOUT = 1 << 16  # bytes
 RED = (40, 40, 220)  # blue, green, red
 STANDS_OUT = 60  # by which red exceeds green and blue where something is drawn
 
@@ -39,7 +38,7 @@ def read_zones(folder: Path, plan: FloorPlan) -> Bool:
     except (OSError, ValueError):
         raise StereoSfmError(f"{folder / DRAWING} is not an image: remove it to begin with an empty drawing") from None
     try:
-        about: Any = read_yaml(folder / ABOUT, MOST_ABOUT)
+        about: Any = read_yaml(folder / ABOUT)
         resolution, origin = float(about["resolution"]), np.array(about["origin"][:2], float)
     except (OSError, KeyError, TypeError, ValueError):
         raise StereoSfmError(f"{folder / ABOUT} does not say where the drawing lies: remove {DRAWING} too") from None

@@ -62,20 +62,17 @@ class WholeFile:
         """Close it, and put it in its place. Once."""
         if self.place != self.path:
             os.replace(self.place, self.path)
-        self._close()
-
-    def leave(self) -> None:
-        """Close it where it is: it is not whole, and an older file of its name stays. Once."""
-        self._close()
+        self.close()
 
     def discard(self) -> None:
         """Close and remove it; an older file of its name stays."""
         if stat.S_ISREG(os.fstat(self.fd).st_mode):
             with contextlib.suppress(OSError):
                 self.place.unlink()
-        self._close()
+        self.close()
 
-    def _close(self) -> None:
+    def close(self) -> None:
+        """Close it where it is: what is not whole stays beside an older file of its name. Once."""
         for descriptor in (self.fd, self._older):
             if descriptor is not None:
                 os.close(descriptor)

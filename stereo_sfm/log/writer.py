@@ -215,7 +215,7 @@ class LogWriter:
             self.closed = True
             place = self._whole.place
             messages = repair.finish_in_place(place)
-            self._whole.leave()
+            self._whole.close()
             self._failure = StereoSfmError(
                 f"recording stopped, {error.strerror or error}: {place} is closed and readable up to that point "
                 f"({messages} messages, {place.stat().st_size / 1e6:.1f} MB)"

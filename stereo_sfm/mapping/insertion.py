@@ -131,7 +131,7 @@ def _local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, c
         seen_points: rows of points that the new keyframe observes.
         reach: metres; keyframes closer than that whose optical axes differ by less than 60 degrees are neighbours.
     """
-    first = map_.seeing(seen_points)[: config.most_keyframes]
+    first = map_.made_by(map_.sightings(seen_points)[0])[: config.most_keyframes]
     second = [map_.neighbours(int(k), config.connected_points)[:5] for k in first]
     alive = map_.living_keyframes()
     pose = map_.keyframes.map_T_kf[alive]

@@ -84,15 +84,15 @@ class Map:
             seen[self.seen_by(row)] = True
         return np.flatnonzero(seen)
 
-    def seeing(self, points: I64, at_least: int = 1) -> I64:
-        """Rows of the keyframes that observe so many of the points: most of them first, then oldest first."""
-        counts = np.bincount(self.observations.kf[self.sightings(points)[0]])
+    def made_by(self, observations: I64, at_least: int = 1) -> I64:
+        """Rows of the keyframes that so many of these observations (rows) are of: most first, then oldest first."""
+        counts = np.bincount(self.observations.kf[observations])
         rows = np.flatnonzero(counts >= max(at_least, 1))
         return rows[np.argsort(-counts[rows], kind="stable")]
 
     def neighbours(self, row: int, at_least: int = 1) -> I64:
-        """Rows of the keyframes that share so many points with one, in the order of `seeing`."""
-        rows = self.seeing(self.seen_by(row), at_least)
+        """Rows of the keyframes that share so many points with one, in the order of `made_by`."""
+        rows = self.made_by(self.sightings(self.seen_by(row))[0], at_least)
         return rows[rows != row]
 
     def sightings(self, points: I64) -> tuple[I64, I64]:

@@ -93,7 +93,7 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     pts = map_.points_of_keyframes(moving)
     pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
     obs, obs_pt = map_.sightings(pts)
-    seeing = map_.seeing(pts)
+    seeing = map_.made_by(obs)
     held = np.sort(seeing[~np.isin(seeing, moving)][:most_fixed])
     kfs = np.concatenate([np.sort(moving), held])
     fixed = np.arange(len(kfs)) >= len(moving)

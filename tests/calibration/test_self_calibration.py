@@ -11,7 +11,7 @@ import pytest
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calibration.row_errors import RowMonitor
-from stereo_sfm.calibration.self_calibration import KEYFRAMES, Revision, SelfCalibration
+from stereo_sfm.calibration.self_calibration import KEYFRAMES, MIN_WINDOWS, Revision, SelfCalibration
 from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
@@ -83,7 +83,7 @@ def test_the_more_significant_the_sooner(name: str) -> None:
         estimator = SelfCalibration(believed)
         next(k for k in keyframes([true] * 64, believed, 0) if estimator.add(k) is not None)
         windows.append(len(estimator.windows))
-    assert windows[0] == 0 and 2 <= windows[1] <= windows[2]
+    assert windows[0] == 0 and MIN_WINDOWS <= windows[1] <= windows[2]
 
 
 @pytest.mark.parametrize("name", RIGS)

@@ -15,7 +15,6 @@ from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.types import U8
 
 PICTURE, ABOUT = "height.png", "costmap.yaml"  # both have the same pixels
-MOST_ABOUT = 1 << 16  # bytes
 MOST_PX = 2048  # a side: more takes long on a telephone
 
 
@@ -49,7 +48,7 @@ class SurfacePictures:
 
     def _made(self, axes: RobotAxes, written: int) -> SurfacePicture | None:
         image = cv2.imdecode(np.frombuffer(read_bytes(self._folder / PICTURE), np.uint8), cv2.IMREAD_UNCHANGED)
-        about = read_yaml(self._folder / ABOUT, MOST_ABOUT)
+        about = read_yaml(self._folder / ABOUT)
         if image is None or image.ndim != 3 or image.shape[2] != 4:
             return None
         step = -(-max(image.shape[:2]) // MOST_PX)
