@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 
@@ -30,6 +31,7 @@ TURN_S = 60.0
 SURE_S = 5.0  # of each turn, and of each session, that do not count: processes start
 LATE_S = 0.1  # from image to pose: three images
 BUSY = 8
+DONE = "attacks.txt"
 REQUESTS = 200  # hostile ones before the next kind of attack
 SIGMAS = 3.0  # by which the share of late poses may differ by chance
 TURNS = tuple((busy, attacked) for busy in (False, True) for attacked in (False, True))
@@ -39,12 +41,17 @@ ATTACKS = (
 )  # fmt: skip
 
 
-def attack(target: Target) -> None:
-    """Body of the process that attacks: it gets what others leave of the processor, as if it were another computer."""
+def attack(target: Target, busy: bool) -> None:
+    """Body of the process that attacks: it gets what others leave of the processor, as if it were another computer.
+
+    What it has done is a line each in `DONE`.
+    """
     os.nice(19)
-    for one in itertools.cycle(ATTACKS):
-        with suppress(Exception):
-            one(target)
+    with (target.folder / DONE).open("a", buffering=1) as done:
+        for one in itertools.cycle(ATTACKS):
+            with suppress(Exception):
+                closed = one(target)[1]
+                done.write(f"{one.__name__} {busy:d} {closed:d}\n")
 
 
 class Turns:
@@ -52,6 +59,7 @@ class Turns:
 
     def __init__(self, folder: Path, page: int, foxglove: int, poses: int) -> None:
         self._target = Target(folder, page, foxglove, poses, REQUESTS, None)  # type: ignore[arg-type]
+        (folder / DONE).unlink(missing_ok=True)
         self.delays: dict[tuple[bool, bool], list[float]] = {turn: [] for turn in TURNS}
         self._turn: tuple[bool, bool] | None = None
         self._counts_from_s = math.inf
@@ -88,7 +96,7 @@ class Turns:
             if busy and self._rest.is_set():
                 continue
             loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY * busy)]
-            attacker = spawn.Process(target=attack, args=(self._target,), daemon=True) if attacked else None
+            attacker = spawn.Process(target=attack, args=(self._target, busy), daemon=True) if attacked else None
             if attacker is not None:
                 attacker.start()
             self._turn, self._counts_from_s = (busy, attacked), time.monotonic() + SURE_S
@@ -99,9 +107,21 @@ class Turns:
             if over:
                 return
 
+    def _judge_attacks(self) -> list[str]:
+        """Print what was done to the service; that it was not attacked."""
+        file = self._target.folder / DONE
+        done = [line.split() for line in file.read_text().splitlines()] if file.exists() else []
+        for busy in (False, True):
+            kinds = Counter(name for name, beside, _ in done if beside == f"{busy:d}")
+            said = ", ".join(f"{count} {name}" for name, count in sorted(kinds.items()))
+            print(f"  {BUSY * busy} busy loops, attacks: {said or 'none'}")
+        still_open = sum(closed == "0" for *_, closed in done)
+        print(f"  {len(done)} attacks, {still_open} with another outcome than on a quiet computer")
+        return [] if done or not self.delays[False, True] else ["no attack was carried out"]
+
     def judge(self) -> list[str]:
         """Print what was measured; where more poses were late with attacks."""
-        wrong = list[str]()
+        wrong = self._judge_attacks()
         for (busy, attacked), delays in self.delays.items():
             ms = 1e3 * np.array(delays or [math.nan])
             late = sum(d > LATE_S for d in delays)

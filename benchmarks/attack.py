@@ -432,13 +432,14 @@ TESTED = (
     (4, "pages and sockets are given anything", "service/test_hostile_requests.py"),
     (5, "DDS listens on every network and nothing says so", "service/test_page.py::test_what_is_open_is_listed"),
     (6, "a file that is being written is replaced", "log/test_whole_file.py"),
+    (8, "poses wait for the map after a restart, a standby is dead", "pipeline/test_standby.py"),
     (10, "the folder of recordings is deleted, the disk is full", """
         recording/test_segments.py::test_a_folder_that_is_deleted_is_made_again
         recording/test_segments.py::test_the_reason_of_a_disk_that_refuses_is_a_sentence
         recording/test_segments.py::test_a_full_disk_costs_images_and_no_pose
         recording/test_segments.py::test_marks_of_the_service_age_and_leave_room"""),
     (11, "an output leaves shared memory",
-     "service/test_stop.py::test_libraries_of_an_output_clean_up_at_its_end_if_they_do_that_in_time"),
+     "service/test_stop.py::test_shared_memory_of_dds_that_nobody_uses_is_removed"),
     (12, "a tilted camera's pose climbs on a flat floor", "service/test_robot_mounting.py"),
     (13, "poses age where a source cannot keep its rate", """
         service/test_parts.py::test_a_recording_that_is_slower_than_its_stamps_does_not_age

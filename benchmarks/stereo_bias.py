@@ -147,7 +147,7 @@ def errors(rig: Rig, pairs: Iterator[Pair]) -> dict[str, F64]:
         off = np.random.default_rng(n).normal(1, OFF, len(uv))
         rho = _bilinear(1 / metres, uv)
         points = rig.left.unproject(uv) / rho[:, None]
-        followed = matcher.follow(*pyramids, uv, points * off[:, None], np.eye(4))
+        followed = matcher.follow(*pyramids, uv, points * off[:, None], np.eye(4), np.zeros_like(uv))
         beside = np.column_stack([_nearest(truth.disparity, uv), _circumstances(rig, left, truth, uv)])
         for kind, found in (("new", np.where(match.good[:, None], match.uv_right, np.nan)), ("followed", followed)):
             error = ((found - exact) * nearer).sum(1)

@@ -11,6 +11,7 @@ import os
 import select
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from stereo_sfm.commands._stop import INTERRUPTED
@@ -133,6 +134,34 @@ def _output_closed() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in reader.poll(0))
 
 
+def _fetch_inputs(options: argparse.Namespace) -> None:
+    """Replace what a command reads by copies, where it is in a bucket.
+
+    Raises:
+        StereoSfmError: it cannot be fetched, or is not what a command reads: the folder `s3:` would be made of it.
+    """
+    for name, value in vars(options).items():
+        if isinstance(value, list):
+            setattr(options, name, [_fetched(one) for one in value])
+        else:
+            setattr(options, name, _fetched(value))
+
+
+def _fetched(value: object) -> object:
+    if not isinstance(value, Path):
+        return value
+    from stereo_sfm.storage.remote import InputPath, of_path
+
+    remote = of_path(value)
+    if remote is None:
+        return value
+    if not isinstance(value, InputPath):
+        raise StereoSfmError(f"{remote} cannot be here, only a path ('stereo-sfm fleet upload' sends a folder)")
+    from stereo_sfm.fleet.copies import fetched
+
+    return fetched(remote)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point.
 
@@ -152,6 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.command is None:
             parser.print_help()
             return 0
+        _fetch_inputs(options)
         command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
         code = command.run(options)
         if argv is None and options.command == "serve":

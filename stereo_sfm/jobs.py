@@ -79,7 +79,8 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
         try:
             while waiting or pending:
                 ready = [job for job in waiting if all(name in results for name in job.after)]
-                waiting = [job for job in waiting if job not in ready]
+                chosen = {job.name for job in ready}
+                waiting = [job for job in waiting if job.name not in chosen]
                 for job in ready:
                     before = {name: results[name] for name in job.after}
                     pending[remote.remote(job.work, job.args, before, limits)] = job
@@ -162,9 +163,11 @@ def _within(work: Callable[..., Result], args: tuple[Any, ...], before: Mapping[
     except StereoSfmError as error:
         return {"ok": False, "error": str(error)}
     except TimeoutError:
-        return {"ok": False, "error": f"it took more than {limits.minutes:g} minutes"}
+        most = f"it took more than {limits.minutes:g} minutes"
+        return {"ok": False, "error": most if limits.minutes else traceback.format_exc()}
     except MemoryError:
-        return {"ok": False, "error": f"it needs more than {limits.memory_gb:g} GB of memory"}
+        most = f"it needs more than {limits.memory_gb:g} GB of memory"
+        return {"ok": False, "error": most if limits.memory_gb else "this computer has too little memory for it"}
     except Exception:
         return {"ok": False, "error": traceback.format_exc()}
 

@@ -1,7 +1,7 @@
 """What is checked of a bag before the rosbags library sees it, which opens files by their names and trusts their text.
 
-A bag is a file, or a folder of files with metadata.yaml. In it, and in each .db3, stand the qualities of service of the
-topics, a text that the library parses, too.
+A bag is a file, or a folder of files with metadata.yaml. In it, and in each .db3 and .mcap, stand the qualities of
+service of the topics, a text that the library parses, too.
 """
 
 from __future__ import annotations
@@ -13,9 +13,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from mcap.reader import make_reader
+
 from stereo_sfm.input_file import count_values, open_regular, read_yaml
+from stereo_sfm.log.chunks import DAMAGE
+from stereo_sfm.log.scan import build_index, summary_is_whole
 
 METADATA = "metadata.yaml"
+INFORMATION = "rosbag2_bagfile_information"  # the key of all that it says
 MOST_METADATA = 4 << 20  # bytes: a bag in ten thousand files has some 1.5 MB
 _ANOTHER_PATH = re.compile(r"[?#]|%[0-9a-fA-F]{2}")  # of a path in the address of a database
 _QUALITIES = "offered_qos_profiles"
@@ -42,18 +47,47 @@ def check_bag(path: Path) -> None:
             values = count_values(text, values + 1)
 
 
+def read_metadata(folder: Path) -> dict[str, Any]:
+    """What the metadata.yaml of a bag says.
+
+    Raises:
+        NotAFile: it is no regular file, or larger than `MOST_METADATA`. OSError: it cannot be read.
+        ValueError: it is no YAML, or no mapping.
+    """
+    data = read_yaml(folder / METADATA, MOST_METADATA)
+    if not isinstance(data, dict):
+        raise ValueError(f"its {METADATA} does not list its topics")
+    return data
+
+
 def _texts(file: Path) -> Iterator[Any]:
     """The texts in a file that are parsed as YAML."""
     if file.name == METADATA:
-        data = read_yaml(file, MOST_METADATA)
+        data = read_metadata(file.parent)
         try:
-            topics = data["rosbag2_bagfile_information"]["topics_with_message_count"]
+            topics = data[INFORMATION]["topics_with_message_count"]
             found = [topic["topic_metadata"].get(_QUALITIES) for topic in topics]
         except (LookupError, TypeError, AttributeError):
             raise ValueError(f"its {METADATA} does not list its topics") from None
+    elif file.suffix == ".mcap":
+        found = _of_channels(file)
     else:
         found = _of_table(file) if file.suffix == ".db3" else []
     yield from (text for text in found if isinstance(text, str))
+
+
+def _of_channels(file: Path) -> list[Any]:
+    """The texts of a file's channels: those listed at its end, or, where the library reads all of it, all of them."""
+    with open_regular(file) as stream:
+        try:
+            whole = summary_is_whole(stream)
+            stream.seek(0)
+            summary = make_reader(stream).get_summary() if whole else None
+        except DAMAGE:
+            summary = None
+        listed = summary is not None and summary.schemas and (summary.statistics or summary.chunk_indexes)
+        channels = summary.channels if summary is not None and listed else build_index(stream).channels
+    return [channel.metadata.get(_QUALITIES) for channel in channels.values()]
 
 
 def _of_table(file: Path) -> Iterator[Any]:

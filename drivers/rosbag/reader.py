@@ -9,6 +9,7 @@ from __future__ import annotations
 import sqlite3
 import zlib
 from collections.abc import Collection, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +19,13 @@ from mcap.records import Channel, Schema
 
 from stereo_sfm.drivers.mcap.foreign import ForeignSource
 from stereo_sfm.drivers.rosbag.checked import check_bag
-from stereo_sfm.drivers.rosbag.unpacked import from_zstd, limit_chunks, take_unpacking
+from stereo_sfm.drivers.rosbag.unpacked import (
+    from_zstd,
+    limit_chunks,
+    limit_chunks_of_mcap,
+    take_unpacking,
+    unpacked_files,
+)
 from stereo_sfm.drivers.source import Stamps
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.input_file import NotAFile
@@ -78,16 +85,21 @@ class BagReader:
         self._ros_1 = path.suffix == _SUFFIX_ROS_1
         self._types = get_typestore(Stores.LATEST)
         self._packed = False  # each message is compressed
-        self._reader: Any = self._opened()
+        with ExitStack() as opened:
+            self._reader: Any = self._opened(opened)
+            self._close = opened.pop_all().close
         self._channels = {c.id: self._described(c) for c in self._reader.connections}
 
-    def _opened(self) -> Any:
+    def _opened(self, opened: ExitStack) -> Any:
         from rosbags import rosbag1, rosbag2
 
         try:
             check_bag(self.path)
-            reader = rosbag1.Reader(self.path) if self._ros_1 else rosbag2.Reader(self.path)
+            path = unpacked_files(self.path, opened)
+            limit_chunks_of_mcap()
+            reader = rosbag1.Reader(path) if self._ros_1 else rosbag2.Reader(path)
             reader.open()
+            opened.callback(reader.close)
             _check_index(reader)
             if self._ros_1:
                 limit_chunks(reader)
@@ -113,9 +125,7 @@ class BagReader:
 
     def close(self) -> None:
         """Close the files; may be called twice."""
-        if self._reader is not None:
-            reader, self._reader = self._reader, None
-            reader.close()
+        self._close()
 
     @property
     def topics(self) -> list[TopicInfo]:

@@ -67,7 +67,7 @@ def _results(tasks: Sequence[BatchTask], address: str | None) -> Iterator[tuple[
 
     try:
         yield from run_batch(tasks, address)
-    except (ConnectionError, ValueError) as error:
+    except (ConnectionError, ValueError, RuntimeError) as error:  # the last: this computer is no node of it
         if address is None:
             raise
         raise StereoSfmError(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
 from stereo_sfm.errors import StereoSfmError, writing_to
+from stereo_sfm.storage.remote import InputPath
 
 if TYPE_CHECKING:
     from stereo_sfm.eval.compare import ComparedRun
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of a run")
+    parser.add_argument("runs", nargs="+", type=InputPath, metavar="RUN", help="folder of a run")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of page and tables")
     parser.add_argument("--ref", help="ground truth: a trajectory file, or a source that has it (default: of the runs)")
     parser.add_argument("--open", action="store_true", help="show the page in a browser")

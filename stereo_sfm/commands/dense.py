@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereo_sfm.commands._options import typed
+from stereo_sfm.storage.remote import InputPath
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("source", type=Path, metavar="RUN|MAP", help="folder of a run, or of a saved map")
+    parser.add_argument("source", type=InputPath, metavar="RUN|MAP", help="folder of a run, or of a saved map")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder to write or to go on")
     parser.add_argument(
         "--images",

@@ -6,14 +6,15 @@ import argparse
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError, writing_to
+from stereo_sfm.storage.remote import InputPath
 
 CHECK_FAILED = 3
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("a", type=Path, metavar="A", help="the folder of a run, or a log (.mcap)")
-    parser.add_argument("b", type=Path, metavar="B", help="the other")
+    parser.add_argument("a", type=InputPath, metavar="A", help="the folder of a run, or a log (.mcap)")
+    parser.add_argument("b", type=InputPath, metavar="B", help="the other")
     parser.add_argument(
         "--topics", nargs="+", default=[], metavar="TOPIC", help="compare only these topics, of runs in their logs"
     )

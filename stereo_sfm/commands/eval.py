@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.commands._options import typed
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_json
+from stereo_sfm.storage.remote import InputPath
 
 if TYPE_CHECKING:
     from stereo_sfm.eval.evaluate import Evaluation
@@ -24,7 +25,7 @@ CHECK_FAILED = 3
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("estimate", type=Path, help="a run's folder, or a trajectory file (TUM, KITTI, EuRoC)")
+    parser.add_argument("estimate", type=InputPath, help="a run's folder, or a trajectory file (TUM, KITTI, EuRoC)")
     parser.add_argument(
         "--ref",
         help="ground truth: a trajectory file, or a source that has it (default: the ground truth in the run's log)",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
 from stereo_sfm.export.formats import MAP_FORMATS, TRAJECTORY_FORMATS, export_map, export_trajectory
+from stereo_sfm.storage.remote import InputPath
 
 if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap
@@ -21,7 +22,7 @@ DENSE = "colmap-dense"  # as COLMAP's fusion reads it
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("source", type=Path, metavar="RUN|MAP", help="folder of a run or of a map")
+    parser.add_argument("source", type=InputPath, metavar="RUN|MAP", help="folder of a run or of a map")
     parser.add_argument("--format", required=True, choices=(*MAP_FORMATS, DENSE, *TRAJECTORY_FORMATS))
     parser.add_argument("-o", "--output", type=Path, metavar="PATH", help="file or folder to write")
     parser.add_argument("--overwrite", action="store_true", help="replace what lies there")

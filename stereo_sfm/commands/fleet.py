@@ -67,7 +67,7 @@ def _run(plan: Plan, address: str | None) -> int:
         if not result.get("resumed"):
             version = f", version {result['version']}" if result.get("version") else ""
             print(f"{count} {job.name}: {'; '.join(why) or 'ok'}{version}", file=sys.stderr)
-    deleted = forget_images(plan, walks, datetime.date.today())
+    deleted = forget_images(plan, walks, datetime.date.today(), waiting)
     nights = len({(walk.store, walk.night) for walk in walks})
     print(
         f"{len(walks)} walks in {nights} nights of {len({walk.store for walk in walks})} stores:"
@@ -84,7 +84,7 @@ def _results(plan: Plan, address: str | None, walks: list[Walk]) -> Iterator[tup
         return
     try:
         yield from run_plan(plan, address, walks)
-    except (ConnectionError, ValueError) as error:
+    except (ConnectionError, ValueError, RuntimeError) as error:  # the last: this computer is no node of it
         if address is None:
             raise
         raise StereoSfmError(f"no Ray cluster at {address}: {str(error).splitlines()[0]}") from None

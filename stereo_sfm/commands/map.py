@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
+from stereo_sfm.storage.remote import InputPath
 
 if TYPE_CHECKING:
     from stereo_sfm.loop.vocabulary import Vocabulary
@@ -22,17 +23,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     info = actions.add_parser("info", help="describe a map")
-    info.add_argument("map", type=Path, help="map folder")
+    info.add_argument("map", type=InputPath, help="map folder")
     merge = actions.add_parser("merge", help="merge the maps of several sessions in one store")
     merge.add_argument(
-        "maps", type=Path, nargs="+", metavar="MAP", help="map folders; the result is in the frame of the first"
+        "maps", type=InputPath, nargs="+", metavar="MAP", help="map folders; the result is in the frame of the first"
     )
     _output(merge)
     merge.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="set a configuration value, as in 'run'"
     )
     prune = actions.add_parser("prune", help="remove points that are no longer there")
-    prune.add_argument("map", type=Path, help="map folder")
+    prune.add_argument("map", type=InputPath, help="map folder")
     _output(prune)
     prune.add_argument(
         "--min-views", type=int, default=0, metavar="N", help="remove points seen by fewer than N keyframes"

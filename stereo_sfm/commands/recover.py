@@ -6,11 +6,12 @@ import argparse
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.storage.remote import InputPath
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("input", type=Path, metavar="IN.mcap", help="the file to repair")
+    parser.add_argument("input", type=InputPath, metavar="IN.mcap", help="the file to repair")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="file to write")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import add_verbosity_arguments, add_wiring_arguments, typed, wiring_of
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.storage.remote import InputPath
 
 if TYPE_CHECKING:
     from stereo_sfm.commands._execute import RunOptions
@@ -25,7 +26,7 @@ DIFFERENT = 3
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("run", type=Path, help="run.mcap or the folder of a run")
+    parser.add_argument("run", type=InputPath, help="run.mcap or the folder of a run")
     parser.add_argument("--source", help="source of the images (default: the log, else the run's own source)")
     parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_NAME)")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing run in the output folder")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import add_viewer_address, typed
 from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.storage.remote import InputPath
 
 if TYPE_CHECKING:
     from stereo_sfm.calib.rig import Rig
@@ -26,7 +27,7 @@ MESH = "mesh.ply"  # in a folder of `dense`
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument(
-        "file", type=Path, help="run.mcap, a run's folder, a saved map, a folder of dense, or any recording"
+        "file", type=InputPath, help="run.mcap, a run's folder, a saved map, a folder of dense, or any recording"
     )
     parser.add_argument("--source", help="source of the images, for a run whose log has none")
     parser.add_argument("--serve", action="store_true", help="serve the viewer to browsers instead of opening a window")

@@ -40,6 +40,7 @@ STAGES: dict[str, dict[str, Any]] = {
 SYSTEMS = ("default", "retail-thesis", "sparse-localization", "cpp-course")
 _MIN_TRACKED = 0.5  # below this share of frames with a pose, a cell has no result
 _SCHEMA = 1
+_CHECKSUM = "sha256"  # of the rest of a result
 
 
 @dataclass(frozen=True)
@@ -186,12 +187,13 @@ def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[
 
 
 def load_result(path: Path) -> dict[str, Any] | None:
-    """A finished cell's file, or None where there is none or it was cut off."""
+    """A finished cell's file, or None where there is none or it was cut off or damaged."""
     try:
         data = read_json(path)
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
-    return data if isinstance(data, dict) and data.get("schema") == _SCHEMA else None
+    whole = isinstance(data, dict) and data.pop(_CHECKSUM, "") == _checksum(data)
+    return data if whole and data.get("schema") == _SCHEMA else None
 
 
 def finished(result: dict[str, Any] | None) -> bool:
@@ -205,5 +207,9 @@ def finished(result: dict[str, Any] | None) -> bool:
 def save_result(path: Path, result: dict[str, Any]) -> None:
     """Write whole or not at all, so that an interrupted grid can go on."""
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(result), encoding="utf-8")
+    part.write_text(json.dumps({**result, _CHECKSUM: _checksum(result)}), encoding="utf-8")
     part.replace(path)
+
+
+def _checksum(result: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(result).encode()).hexdigest()

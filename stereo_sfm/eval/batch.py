@@ -49,7 +49,11 @@ def names(recordings: Sequence[str]) -> list[str]:
 
 
 def run_one(task: BatchTask) -> dict[str, Any]:
-    """Run one recording to the end; errors become part of the result."""
+    """Run one recording to the end; errors become part of the result.
+
+    Raises:
+        TimeoutError, MemoryError: the limits of its job.
+    """
     import cv2
 
     from stereo_sfm.drivers.choice import SourceChoice
@@ -77,6 +81,8 @@ def run_one(task: BatchTask) -> dict[str, Any]:
         result |= {"ok": True, "stats": stats}
     except StereoSfmError as error:
         result |= {"ok": False, "error": str(error), "kind": type(error).__name__}
+    except (TimeoutError, MemoryError):
+        raise
     except Exception:
         result |= {"ok": False, "error": traceback.format_exc()}
     folder.mkdir(parents=True, exist_ok=True)

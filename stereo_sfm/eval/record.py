@@ -14,13 +14,13 @@ from scipy.sparse.csgraph import connected_components
 
 from stereo_sfm.config import Config
 from stereo_sfm.eval.frame_table import FrameTable, TimeTable
+from stereo_sfm.eval.smoothing import smooth_bridges
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.maps.mounting import MountingEstimate
 from stereo_sfm.messages import Health, LogEnded, LogLine, SourceCounters, StageTimes
 from stereo_sfm.recording.describe import GAP
-from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import (
     F64,
     I64,

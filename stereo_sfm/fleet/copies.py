@@ -14,7 +14,7 @@ from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet.patches import expanded
-from stereo_sfm.fleet.versions import StoredFile, Version, patch_name, read_file, read_version, released
+from stereo_sfm.fleet.versions import HEAD, StoredFile, Version, patch_name, read_file, read_version, released
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.input_file import read_bytes, read_json
 from stereo_sfm.maps.replace_folder import recover, replaced_folder
@@ -127,29 +127,27 @@ def _patched(store: Remote, data: bytes, have: str, steps: list[StoredFile]) -> 
 def fetched_map(remote: Remote, robot: str = "") -> Path:
     """A map in a bucket as a folder of the cache: a robot's version of a store, or a map folder as it is.
 
-    Without a network it is the version that was fetched last.
+    Where the network is away, or the version is damaged, it is the version that was fetched last.
 
     Raises:
         StereoSfmError: there is no map, or it is damaged.
     """
     place = cache_root() / "stores" / hashlib.sha256(str(remote).encode()).hexdigest()[:16] / remote.name
-    try:
-        if objects.exists(remote / "map.json"):
-            return fetch(remote)
-        version = released(remote, robot)
-    except objects.Unreachable:
-        if version_of(place)[0]:
-            log.warning("%s cannot be reached: version %d is used", remote, version_of(place)[1])
-            return place
-        raise
     place.parent.mkdir(parents=True, exist_ok=True)
     with FolderLock(place.parent, "another program fetches this map: try again"):
-        fetch_version(remote, version, place)
+        if not version_of(place)[1] and objects.exists(remote / "map.json"):
+            return fetch(remote)
+        fetch_released(remote, robot, place)
     return place
 
 
+def fetched(remote: Remote) -> Path:
+    """A copy of a file, a folder or a store's map in the cache."""
+    return fetched_map(remote) if objects.exists(remote / HEAD) else fetch(remote)
+
+
 def fetch_released(remote: Remote, robot: str, folder: Path) -> None:
-    """Make a folder the version that a robot should have, at the start of its service.
+    """Make a folder the version that a robot should have.
 
     Where the network is away, or the version is damaged, a folder that has one already stays as it is.
 

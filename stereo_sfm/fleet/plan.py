@@ -11,7 +11,9 @@ All of a store is below one prefix, so that rights can be given by store.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import datetime
 import hashlib
 import json
 import re
@@ -129,10 +131,20 @@ def _listed(file: Path, walks: Any) -> Iterator[Walk]:
     for walk in walks if isinstance(walks, list) else [None]:
         if not isinstance(walk, dict) or walk.keys() != wanted or not all(isinstance(v, str) for v in walk.values()):
             raise StereoSfmError(f"{file}: each [[walk]] has the texts {', '.join(sorted(wanted))}, and no others")
-        if any("/" in walk[name] or not walk[name] for name in ("store", "night", "robot")):
-            raise StereoSfmError(f"{file}: store, night and robot of a [[walk]] are names without slashes")
+        if any("/" in walk[name] or not walk[name] for name in ("store", "robot")):
+            raise StereoSfmError(f"{file}: store and robot of a [[walk]] are names without slashes")
+        if night_of(walk["night"]) != walk["night"]:
+            raise StereoSfmError(f"{file}: the night of a [[walk]] is a date such as 2026-11-25")
         name = f"{walk['robot']}/{hashlib.sha256(walk['source'].encode()).hexdigest()[:12]}"
         yield Walk(name=name, **walk)
+
+
+def night_of(name: str) -> str:
+    """The date in a name, else `UNDATED`."""
+    for found in _NIGHT.findall(name):
+        with contextlib.suppress(ValueError):
+            return datetime.date.fromisoformat(found).isoformat()
+    return UNDATED
 
 
 def explain(plan: Plan) -> str:
@@ -162,11 +174,10 @@ def find_walks(plan: Plan) -> tuple[list[Walk], list[str]]:
             if not is_file and not any(file.rpartition("/")[2] in _WHOLE for file, _, _ in files):
                 waiting.append(str(place / name))
                 continue
-            night = _NIGHT.search(name.partition("/")[2])
             state = hashlib.sha256(repr(files).encode()).hexdigest()[:16]
             walks.append(
                 Walk(
-                    store, night[0] if night else UNDATED, name.partition("/")[0], name, str(place / name), state,
+                    store, night_of(name.partition("/")[2]), name.partition("/")[0], name, str(place / name), state,
                     sum(size for _, size, _ in files),
                 )
             )  # fmt: skip

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import groupby, pairwise
 from typing import Any
 
-from stereo_sfm.fleet.plan import UNDATED, Plan, Walk
+from stereo_sfm.fleet.plan import UNDATED, Plan, Walk, night_of
 from stereo_sfm.fleet.steps import job_name, map_walk, read_json, update_store
 from stereo_sfm.jobs import Job, Limits, Result, run_jobs
 from stereo_sfm.storage import objects
+from stereo_sfm.storage.remote import Remote
 from stereo_sfm.storage.spool import SUM
 
 
@@ -38,8 +39,10 @@ def run_plan(plan: Plan, address: str | None, walks: list[Walk]) -> Iterator[tup
     yield from run_jobs(jobs_of(plan, walks), limits, address, "fleet")
 
 
-def forget_images(plan: Plan, walks: list[Walk], today: datetime.date) -> int:
+def forget_images(plan: Plan, walks: list[Walk], today: datetime.date, waiting: Sequence[str] = ()) -> int:
     """Delete recordings that are older than the plan allows; maps, results and tables stay.
+
+    Args: walks, of which those whose map is not made yet are kept. waiting: folders that have not arrived as a whole.
 
     Returns:
         Bytes that were deleted.
@@ -48,19 +51,31 @@ def forget_images(plan: Plan, walks: list[Walk], today: datetime.date) -> int:
     if not days:
         return 0
     deleted = 0
+    for place in map(Remote.of, waiting):
+        if (today - _day(night_of(place.name), place)).days > days:
+            files = objects.listed(place)
+            objects.delete([place / name for name, _, _ in files])
+            deleted += sum(size for _, size, _ in files)
     marks: dict[str, Any] = {}
     for walk in walks:
-        old = walk.night != UNDATED and (today - datetime.date.fromisoformat(walk.night)).days > days
-        if not walk.state or not old:  # without a state the plan names its source itself: it is not ours to delete
+        place = plan.root / walk.store / "walks" / walk.name
+        # Without a state the plan names its source itself: it is not ours to delete.
+        if not walk.state or (today - _day(walk.night, place)).days <= days:
             continue
         marker = plan.root / walk.store / "catalogue" / f"{walk.night}.json"
         if str(marker) not in marks:
             marks[str(marker)] = (read_json(marker) or {}).get("walks", {})
         if walk.name not in marks[str(marker)]:  # it came late: its map is made first
             continue
-        place = plan.root / walk.store / "walks" / walk.name
         names = [name for name, _, _ in objects.listed(place)]
         beside = place.parent / f"{place.name}{SUM}"
         objects.delete([place / name for name in names] if names else [place, beside])
         deleted += walk.bytes
     return deleted
+
+
+def _day(night: str, place: Remote) -> datetime.date:
+    """Of a recording: by its name, else when the newest of its files was written."""
+    if night != UNDATED:
+        return datetime.date.fromisoformat(night)
+    return max(objects.written(file) for file in [place / name for name, _, _ in objects.listed(place)] or [place])

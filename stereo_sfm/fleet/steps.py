@@ -13,14 +13,16 @@ import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.fleet.catalogue import night_tables, walk_row, write_tables
 from stereo_sfm.fleet.editing import Checkout, checked_out, session_id
 from stereo_sfm.fleet.plan import Walk
 from stereo_sfm.fleet.versions import Version, history
+from stereo_sfm.input_file import read_json as read_file
 from stereo_sfm.jobs import Result
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.storage import objects
@@ -31,9 +33,24 @@ RESULT = "result.json"
 WRITERS = 10  # tries to write a version while others do
 
 
+class Damaged(StereoSfmError):
+    """What an earlier step made is not there any more."""
+
+
+class Outcome(NamedTuple):
+    """What a night made of a walk."""
+
+    why: str  # it is not in the map, "" if it is
+    session: str  # checksum of its map
+    again: bool = False  # it is tried again next time
+
+
 def map_walk(root: Remote, walk: Walk, config: Config) -> Result:
-    """A session's own map in the bucket, and the numbers of its run. A failure is kept as well, unless it is one of
-    the network: the same bytes fail again."""
+    """A session's own map in the bucket, and the numbers of its run.
+
+    A failure is kept as well where it is one of the bytes, which fail again: not that of the network, of a limit, of an
+    error of ours, nor of a source that the plan names itself.
+    """
     place = root / walk.store / "work" / walk.key(config)
     done = read_json(place / RESULT)
     if done is not None:
@@ -64,7 +81,8 @@ def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
             if made is not None:
                 session = load_map(made)
                 save_map(session, folder / "map", compress=False)
-                return _about(session, session_id(session)) | {"ok": True, "map": str(folder / "map"), "stats": None}
+                about = _about(session, session_id(session))
+                return about | {"ok": True, "map": str(folder / "map"), "stats": _stats_of(here)}
             source = str(here)
         elif walk.state:
             with LogReader(Remote.of(source)) as reader:
@@ -74,8 +92,8 @@ def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
         return {"ok": False, "error": str(error), "lasting": not isinstance(error, objects.Unreachable)}
     result = run_one(BatchTask(source, str(folder / "run"), config, True))
     if not result["ok"]:
-        lasting = result.get("kind") != objects.Unreachable.__name__
-        return {"ok": False, "error": result["error"], "lasting": lasting}
+        ours = result.get("kind") in (None, objects.Unreachable.__name__)
+        return {"ok": False, "error": result["error"], "lasting": bool(walk.state) and not ours}
     try:
         session = load_map(folder / "run" / "map")
     except StereoSfmError:
@@ -83,6 +101,14 @@ def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
     save_map(session, folder / "map", compress=False)
     about = _about(session, session_id(session))
     return about | {"ok": True, "map": str(folder / "map"), "stats": result["stats"]}
+
+
+def _stats_of(run: Path) -> dict[str, Any] | None:
+    """The numbers of the run whose folder a robot has sent; None where it has sent its map alone."""
+    try:
+        return checked_stats(read_file(run / "stats.json"))
+    except (OSError, ValueError):
+        return None
 
 
 def _about(session: Any, identity: str) -> dict[str, Any]:
@@ -116,7 +142,6 @@ def update_store(root: Remote, walks: list[Walk], config: Config, results: Mappi
     marker = root / store / "catalogue" / f"{night}.json"
     mine = {walk: results[job_name(walk)] for walk in walks}
     wanted = {walk.name: walk.key(config) for walk in walks}
-    lasting = all(result.get("lasting") for result in mine.values())  # else a walk is tried again next time
     done = read_json(marker)
     before: dict[str, Any] = done["rows"] if done is not None else {}
     if done is not None and all(done["walks"].get(name) == key for name, key in wanted.items()):
@@ -124,9 +149,10 @@ def update_store(root: Remote, walks: list[Walk], config: Config, results: Mappi
     begin = time.perf_counter()
     place = root / store / "map"
     outcomes, version = _put_all(place, mine, config)
-    failed = {walk.name: why for walk, (why, _) in outcomes.items() if why}
+    lasting = all(result.get("lasting") and not outcomes[walk].again for walk, result in mine.items())
+    failed = {walk.name: outcome.why for walk, outcome in outcomes.items() if outcome.why}
     # Walks whose recordings were deleted since keep their rows.
-    rows = before | {walk.name: walk_row(walk, mine[walk], *outcomes[walk]) for walk in walks}
+    rows = before | {walk.name: walk_row(walk, mine[walk], *outcomes[walk][:2]) for walk in walks}
     versions = history(place) if version is not None else []
     tables = night_tables(store, night, [rows[k] for k in sorted(rows)], versions, time.perf_counter() - begin)
     write_tables(root / store / "catalogue", night, tables)
@@ -142,7 +168,7 @@ def job_name(walk: Walk) -> str:
     return f"{walk.store} {walk.night} {walk.name}"
 
 
-Outcomes = dict[Walk, tuple[str, str]]  # why a walk is not in the map, "" if it is; and the checksum of its session
+Outcomes = dict[Walk, Outcome]
 
 
 def _put_all(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tuple[Outcomes, Version | None]:
@@ -169,23 +195,29 @@ def _put_once(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tup
         changes: list[str] = []
         for walk, result in mine.items():
             identity = str(result.get("id", ""))
-            outcomes[walk] = (result["error"].strip().splitlines()[-1] if not result["ok"] else "", identity)
+            outcomes[walk] = Outcome("" if result["ok"] else result["error"].strip().splitlines()[-1], identity)
             if not result["ok"] or identity in sessions:
                 continue
             held = out.holds(identity)
             if held:
-                outcomes[walk] = ("" if "already" in held else held, identity)
+                outcomes[walk] = Outcome("" if "already" in held else held, identity)
                 continue
             try:
                 changes += _put(out, walk, result, config)
                 sessions[identity] = f"{walk.night} {walk.name}"
-            except StereoSfmError as error:
-                if isinstance(error, objects.Unreachable):
-                    raise
-                outcomes[walk] = (str(error), identity)
+            except (objects.Unreachable, TimeoutError, MemoryError):
+                raise
+            except Exception as error:  # one walk stops no night
+                why = str(error).strip().partition("\n")[0] or type(error).__name__
+                outcomes[walk] = Outcome(
+                    why, identity, isinstance(error, Damaged) or not isinstance(error, StereoSfmError)
+                )
         if not sessions:
             return outcomes, out.version
-        write_store_plan(out.folder)
+        try:
+            write_store_plan(out.folder)
+        except StereoSfmError as error:
+            changes.append(f"no floor plan: {error}")
         return outcomes, out.publish(sessions, changes)
 
 
@@ -193,9 +225,16 @@ def _put(out: Checkout, walk: Walk, result: Result, config: Config) -> list[str]
     from stereo_sfm.maps.put_session import put_session
     from stereo_sfm.maps.saved_map import load_map
 
+    made = Remote.of(result["session"])
     with tempfile.TemporaryDirectory(prefix="session") as folder:
-        fetch_into(Remote.of(result["session"]), Path(folder) / "map")
-        session = load_map(Path(folder) / "map")
-    if session_id(session) != result["id"]:
-        raise StereoSfmError(f"the session's map of {walk.name} is not what was made: delete {result['session']}")
+        try:
+            fetch_into(made, Path(folder) / "map")
+            session = load_map(Path(folder) / "map")
+            if session_id(session) != result["id"]:
+                raise StereoSfmError(f"{made} is not what was made")
+        except objects.Unreachable:
+            raise
+        except StereoSfmError as error:
+            objects.delete([made.parent / RESULT])
+            raise Damaged(f"{error}: it is made again next time") from None
     return put_session(out.folder, session, walk.name, config, compress=False).changes

@@ -108,6 +108,8 @@ def read_version(store: Remote, name: str) -> Version:
 
     def make(data: dict[str, Any]) -> Version:
         files = {key: StoredFile(**file) for key, file in data["files"].items()}
+        if any(Path(key).name != key or key in ("", "..") for key in files):
+            raise ValueError("a file of a map has a plain name")
         fields: dict[str, Any] = {**data, "files": files, "changes": tuple(data["changes"]), "name": name}
         return Version(**fields)
 
@@ -235,6 +237,8 @@ def read_file(store: Remote, file: StoredFile) -> bytes:
 def roll_back(store: Remote) -> Version:
     """Let the version before count again. The sessions of the one that counted are not put in again by themselves.
 
+    Robots that were given the one that counted have what counts, again.
+
     Raises:
         StereoSfmError: there is none before. Changed: another program has written meanwhile.
     """
@@ -245,6 +249,9 @@ def roll_back(store: Remote) -> Version:
     before = read_version(store, now.parent)
     refused = sorted({*head.refused, *(now.sessions.keys() - before.sessions.keys())})
     _exchange(store, dataclasses.replace(head, version=before.name, refused=tuple(refused), by=secrets.token_hex(8)))
+    given, tag = _released(store)
+    if now.name in given.values():
+        _give(store, {robot: name for robot, name in given.items() if name != now.name}, tag)
     return before
 
 
@@ -260,6 +267,11 @@ def release(store: Remote, number: int, robots: tuple[str, ...] = ()) -> None:
     name = numbered(store, number).name
     given, tag = _released(store)
     given = {**given, **dict.fromkeys(robots, name)} if robots else {"": name}
+    _give(store, given, tag)
+
+
+def _give(store: Remote, given: Mapping[str, str], tag: str | None) -> None:
+    """Write the version of each robot, on the condition that nobody else did."""
     data = {"kind": KIND, "by": secrets.token_hex(8), "robots": given}
     objects.exchange(store / RELEASE, (json.dumps(data, indent=1, sort_keys=True) + "\n").encode(), tag)
 

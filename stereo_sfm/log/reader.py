@@ -116,8 +116,8 @@ class LogReader:
         self._stream.seek(0)
         try:
             reader = SeekingReader(self._stream, validate_crcs=True)
-            summary = reader.get_summary()
-            if summary is not None and index_is_whole and _complete(summary):
+            summary = reader.get_summary() if index_is_whole else None
+            if summary is not None and _complete(summary):
                 return reader, summary
         except (*chunks.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
             pass

@@ -31,12 +31,13 @@ from mcap.writer import MCAP0_MAGIC
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import open_regular
-from stereo_sfm.log.chunks import DAMAGE, PREFIX, records
+from stereo_sfm.log.chunks import DAMAGE, MAX_BYTES, PREFIX, records
 from stereo_sfm.log.index import Index, Span
 from stereo_sfm.storage.remote import Place
 
 FOOTER_SIZE = PREFIX + 20
 _LAST_OPCODE = 0x0F
+MOST_RECORD = MAX_BYTES + (1 << 16)  # bytes of a record that is read as a whole; so of the index
 _OF_A_SUMMARY = (
     Opcode.SCHEMA,
     Opcode.CHANNEL,
@@ -73,6 +74,9 @@ def spans(stream: IO[bytes], start: int = len(MCAP0_MAGIC)) -> Iterator[Span]:
 
 
 def _content(stream: IO[bytes], span: Span) -> ReadDataStream:
+    """Raises ValueError for a record larger than any chunk: a file may have holes that take no disk."""
+    if span.length > MOST_RECORD:
+        raise ValueError(f"a record has {span.length} bytes: more than {MOST_RECORD} are not read")
     stream.seek(span.offset + PREFIX)
     return ReadDataStream(BytesIO(stream.read(span.length - PREFIX)))
 
@@ -146,6 +150,8 @@ def summary_is_whole(stream: IO[bytes]) -> bool:
     footer = stream.read(FOOTER_SIZE)
     opcode, length, start, _, crc = struct.unpack("<BQQQI", footer)
     if opcode != Opcode.FOOTER or length != FOOTER_SIZE - PREFIX or not 0 <= start <= footer_at:
+        return False
+    if start and footer_at - start > MOST_RECORD:
         return False
     if start and any(span.opcode not in _OF_A_SUMMARY for span in spans(stream, start) if span.end <= footer_at):
         return False

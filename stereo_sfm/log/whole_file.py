@@ -10,8 +10,21 @@ import stat
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular
 
 MODE = 0o644  # less what the umask takes
+
+
+def being_written(path: Path) -> bool:
+    """Whether a `WholeFile` of any process is open on it; False where there is no such file, or there are no locks."""
+    try:
+        with open_regular(path) as file:
+            fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 class WholeFile:

@@ -21,6 +21,7 @@ MIN_STEPS, MOST_STEPS = 10, 1000  # from which their scatter is known; that are 
 # Standard deviation of a roll about which nothing is known: cameras are mounted without measuring.
 UPRIGHT_RAD = np.deg2rad(5.0)
 ENOUGH_RAD = np.deg2rad(0.2)  # standard deviation of the pitch: 3 mm of height in a metre
+CHANGED_SIGMAS = 4.0  # by which two days differ once in ten thousand
 LEAST = np.array([1e-3, np.deg2rad(0.02), 1e-3]) ** 2  # variances (m^2, rad^2, m^2) below which no odometry is
 FLOOR_RANGE_M = 5.0  # to points of the floor: farther ones are too uncertain for its level
 POINTS = 200  # of a keyframe that are kept: 5 MB of a thousand keyframes
@@ -32,15 +33,36 @@ class Mounting:
     """The vertical as the camera sees it."""
 
     up: F64  # (3,) unit vector in the left camera's axes
-    pitch_deg: float  # by which the camera looks down
-    roll_deg: float  # by which its right side hangs down
     pitch_sigma_deg: float  # standard deviation
     roll_sigma_deg: float
+
+    @property
+    def pitch_deg(self) -> float:
+        """By which the camera looks down."""
+        return -float(np.degrees(np.arcsin(self.up[2])))
+
+    @property
+    def roll_deg(self) -> float:
+        """By which its right side hangs down."""
+        return -float(np.degrees(np.arctan2(self.up[0], -self.up[1])))
 
     @property
     def measured(self) -> bool:
         """Whether the pitch is known well enough to be used."""
         return self.pitch_sigma_deg <= np.degrees(ENOUGH_RAD)
+
+    def contradicts(self, other: Mounting) -> bool:
+        """Whether the camera sits differently now: chance does not explain the difference."""
+        pitch, roll = self.pitch_deg - other.pitch_deg, self.roll_deg - other.roll_deg
+        return bool(
+            abs(pitch) > CHANGED_SIGMAS * np.hypot(self.pitch_sigma_deg, other.pitch_sigma_deg)
+            or abs(roll) > CHANGED_SIGMAS * np.hypot(self.roll_sigma_deg, other.roll_sigma_deg)
+        )
+
+    def surer(self, other: Mounting) -> bool:
+        """Whether it is worth replacing the other: half its standard deviations."""
+        sigmas = self.pitch_sigma_deg + self.roll_sigma_deg
+        return sigmas < 0.5 * (other.pitch_sigma_deg + other.roll_sigma_deg)
 
     @property
     def text(self) -> str:
@@ -122,8 +144,7 @@ class MountingEstimate:
         ahead = np.cross(right, up) / np.linalg.norm(np.cross(right, up))
         across = np.stack([ahead, np.cross(up, ahead)])
         sigma = np.degrees(np.sqrt(np.diag(np.linalg.pinv(across @ hessian @ across.T))))
-        pitch, roll = -np.degrees(np.arcsin(up[2])), -np.degrees(np.arctan2(up[0], -up[1]))
-        return Mounting(up, float(pitch), float(roll), float(sigma[0]), float(sigma[1]))
+        return Mounting(up, float(sigma[0]), float(sigma[1]))
 
     def _floor(self, up: F64) -> tuple[F64, int]:
         """Mean squares (3, 3) of the floor points' offsets in each keyframe, summed; keyframes that see the floor."""

@@ -11,6 +11,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.pipeline.child import WarmUp
 from stereo_sfm.pipeline.stage_graph import start_stages
 from stereo_sfm.pipeline.stage_processes import StageProcesses
+from stereo_sfm.pipeline.watchdog import STOPPED, process_state
 
 
 class Standby:
@@ -35,7 +36,7 @@ class Standby:
                     report.recv_bytes()
         except (EOFError, OSError):
             return False
-        return True
+        return not any(process_state(pid) in STOPPED for pid in self.stages.pids.values())
 
     def close(self) -> None:
         """End them."""

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
+from stereo_sfm.log.whole_file import being_written
 from stereo_sfm.recording.segments import RECORDING, SENT, SENT_END, Segment, recordings, segments, sent_whole
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import SUMS, Pace, send_file, sha256
@@ -37,7 +38,7 @@ class Uploader:
     ) -> None:
         """Args:
         root: of the recordings. to: a folder in a bucket. bytes_s: most bytes a second, 0: no limit.
-        current: the segment that is being written, if any.
+        current: of a recording that goes on, if any: others of it follow. What is being written waits in any case.
         black_box: images are sent of marked segments alone.
         """
         self.root, self.to, self._pace, self._current = root, to, Pace(bytes_s), current
@@ -83,10 +84,13 @@ class Uploader:
         count = 0
         for folder in recordings(self.root):
             current = self._current()
+            over = current is None or current.folder != folder
             for segment in segments(folder):
-                if segment != current:
+                if segment == current or being_written(segment.poses) or being_written(segment.images):
+                    over = False
+                else:
                     count += self._send(segment)
-            if (current is None or current.folder != folder) and not sent_whole(folder):
+            if over and not sent_whole(folder):
                 self._finish(folder)
         return count
 

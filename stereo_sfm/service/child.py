@@ -23,8 +23,6 @@ from stereo_sfm.pipeline.watchdog import HEARTBEAT_S, SILENT_S, Watchdog
 
 log = logging.getLogger(LOGGER)
 
-TIDY_S = 0.6  # for the libraries of an output to clean up, of the second that it has for its end
-
 Send = Callable[[object], None]
 
 
@@ -83,10 +81,8 @@ def end_with_service() -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
-def run_child(name: str, to_service: Connection, body: Callable[[Send], None], tidy: bool = False) -> None:
+def run_child(name: str, to_service: Connection, body: Callable[[Send], None]) -> None:
     """In the child: run its body with a function that sends to the service, then end the process.
-
-    Args: tidy, libraries clean up after themselves at the interpreter's exit, as far as they do that in time.
 
     Stop signals are the service's to handle. Lines of the package's logger are sent as `LogLine`, with the name.
     """
@@ -101,8 +97,4 @@ def run_child(name: str, to_service: Connection, body: Callable[[Send], None], t
     logging.getLogger(LOGGER).setLevel(logging.INFO)
     with Listener(name, send):
         body(send)
-    if not tidy:
-        os._exit(0)  # a thread that waits for the disk may be left
-    end = threading.Timer(TIDY_S, os._exit, (0,))  # so may a server's
-    end.daemon = True
-    end.start()
+    os._exit(0)  # a thread that waits for the disk may be left

@@ -25,7 +25,7 @@ from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.service.child import Send, follow, pipe, run_child, start_child
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import ServiceMessage
-from stereo_sfm.service.outputs import OUTPUTS, TIDY
+from stereo_sfm.service.outputs import OUTPUTS, dds_memory
 from stereo_sfm.service.publisher import Publisher, Reply
 
 log = logging.getLogger(LOGGER)
@@ -125,6 +125,8 @@ class OutputProcess:
 
     def _run_once(self) -> None:
         """Start the process and listen to it until it ends."""
+        if self.name == "ros2":
+            dds_memory.sweep()  # a service before this one may have been killed
         (messages, to_output), (reports, to_main), (replies, to_client) = (pipe() for _ in range(3))
         process = start_child(f"output {self.name}", run_output, self._module, self._config, messages, to_main, replies)
         self.starts += 1
@@ -138,6 +140,8 @@ class OutputProcess:
         for outbox in (self._outbox, self._replies):
             outbox.close()
         process.join()
+        if self.name == "ros2":
+            dds_memory.sweep()
 
     def _take(self, message: object) -> None:
         if isinstance(message, _Opened):
@@ -209,7 +213,7 @@ def run_output(
                 publisher.put(pickle.loads(messages.recv_bytes()))
         publisher.close()
 
-    run_child(f"output {name}", to_main, body, tidy=name in TIDY)
+    run_child(f"output {name}", to_main, body)
 
 
 def make_publisher(module: str, config: RobotConfig) -> Publisher:

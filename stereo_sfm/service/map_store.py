@@ -31,6 +31,7 @@ from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
 from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.fork_server import start_context
+from stereo_sfm.pipeline.watchdog import STOPPED, process_state
 from stereo_sfm.service.child import end_with_service, pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
@@ -181,6 +182,9 @@ class MapStore:
         """The result of `join`, once; None while it runs."""
         result, self._done = self._done, None
         if result is None:
+            process = self._process
+            if process is not None and process.pid is not None and process_state(process.pid) in STOPPED:
+                process.kill()  # it would never answer
             if self._result is None or not self._result.poll(timeout_s):
                 return None
             try:

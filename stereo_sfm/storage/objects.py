@@ -16,7 +16,7 @@ import re
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from contextvars import ContextVar
-from datetime import timedelta
+from datetime import date, timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,10 +28,15 @@ TRIES = 12  # of a request: a tenth of failing answers makes an object fail once
 PATIENCE_S = 180.0  # for all tries of a request: a server that stands still for 20 s costs nothing
 CONNECT_S, REQUEST_S = 5.0, 60.0
 EMULATOR = "STORAGE_EMULATOR_HOST"  # of Google's own libraries: the address of another server than theirs
-FULL = re.compile(r"QuotaExceeded|StorageFull|InsufficientStorage|\b507\b|No space left|os error 28\b", re.I)
-DENIED = re.compile(r"AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|Forbidden|\b40[13]\b|os error 13\b", re.I)
+PARTS_AT_ONCE = 2  # of a large object, 5 MiB each: within `REQUEST_S` at 1.4 Mbit/s
+# What the server or the system answered, in a message that names the object and its address, too.
+ANSWER = re.compile(r"status code: .*|\(os error \d+\)", re.DOTALL)
+FULL = re.compile(r"QuotaExceeded|StorageFull|InsufficientStorage|^status code: 507\b|os error 28\b", re.I)
+DENIED = re.compile(r"AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|^status code: 40[13]\b|os error 13\b", re.I)
 NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|The specified bucket does not exist", re.I)
-CODE = re.compile(r"<Code>(\w+)</Code>|\b([45]\d\d [A-Z][A-Za-z ]+)")
+NO_CREDENTIALS = re.compile(r"credential|service account|account must be specified|169\.254\.169\.254", re.I)
+CREDENTIALS = {"s3": "AWS_ACCESS_KEY_ID", "gs": "GOOGLE_APPLICATION_CREDENTIALS", "az": "AZURE_STORAGE_ACCOUNT_NAME"}
+CODE = re.compile(r"<Code>(\w+)</Code>|^status code: ([45]\d\d [A-Z][A-Za-z ]+)")
 
 
 class Missing(StereoSfmError):
@@ -68,10 +73,14 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
         return LocalStore(prefix=Path("/"), automatic_cleanup=False, mkdir=True)
     options: dict[str, Any] = {}
     if scheme == "s3" and "AWS_ACCESS_KEY_ID" not in os.environ and importlib.util.find_spec("boto3") is not None:
+        from botocore.exceptions import BotoCoreError
         from obstore.auth.boto3 import Boto3CredentialProvider
 
-        with contextlib.suppress(ValueError):  # boto3 knows none: the computer's own role is asked for
-            options["credential_provider"] = Boto3CredentialProvider()
+        try:
+            with contextlib.suppress(ValueError):  # boto3 knows none: the computer's own role is asked for
+                options["credential_provider"] = Boto3CredentialProvider()
+        except BotoCoreError as error:
+            raise ValueError(f"credentials: {type(error).__name__}") from None
     emulator = os.environ.get(EMULATOR, "") if scheme == "gs" else ""
     if emulator:
         options["service_account_key"] = json.dumps(
@@ -94,18 +103,14 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
     return from_url(f"{scheme}://{bucket}", **options)
 
 
-def _of(remote: Remote) -> Any:
-    return _store(remote.scheme, remote.bucket, _patience_s.get())
-
-
 @contextmanager
-def _one_line(remote: Remote, doing: str) -> Generator[None]:
-    """Every error of the library as one of ours."""
+def _opened(remote: Remote, doing: str) -> Generator[Any]:
+    """The store of an object; every error of the library as one of ours."""
     require(("obstore",), "fleet", f"{remote.scheme}://")
     from obstore import exceptions as obx
 
     try:
-        yield
+        yield _store(remote.scheme, remote.bucket, _patience_s.get())
     except (obx.AlreadyExistsError, obx.PreconditionError):
         raise Changed(f"{remote} was written by another program meanwhile") from None
     except (obx.BaseError, OSError, ValueError) as error:
@@ -113,21 +118,24 @@ def _one_line(remote: Remote, doing: str) -> Generator[None]:
 
 
 def _named(remote: Remote, doing: str, error: BaseException, obx: Any) -> StereoSfmError:
-    said = str(error)
-    if NO_BUCKET.search(said):
+    said = str(error).partition("\n\nDebug source")[0].replace(f"/{remote.key}", "")
+    found = ANSWER.search(said)
+    answer = found[0] if found else ""
+    if NO_BUCKET.search(answer):
         return StereoSfmError(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
     if isinstance(error, FileNotFoundError | obx.NotFoundError):
         return Missing(f"there is no {remote}")
-    if FULL.search(said):  # before the rights: some servers answer 403 to what exceeds a limit
+    if FULL.search(answer):  # before the rights: some servers answer 403 to what exceeds a limit
         return StereoSfmError(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
     denied = (PermissionError, obx.PermissionDeniedError, obx.UnauthenticatedError)
-    if isinstance(error, denied) or DENIED.search(said):
+    if isinstance(error, denied) or DENIED.search(answer):
         return StereoSfmError(
             f"no right to {doing} {remote}: check the credentials in the environment, and the rights of this prefix"
         )
-    if "credential" in said.lower() or "169.254.169.254" in said:
-        return StereoSfmError(f"no credentials for {remote.scheme}://: set them in the environment (AWS_ACCESS_KEY_ID)")
-    code = CODE.search(said)
+    if NO_CREDENTIALS.search(said):
+        where = CREDENTIALS.get(remote.scheme, "")
+        return StereoSfmError(f"no credentials for {remote.scheme}://: set them in the environment ({where})")
+    code = CODE.search(answer)
     why = (code[1] or code[2]) if code else "no answer"
     return Unreachable(f"cannot {doing} {remote}: {why}, although it was tried again and again")
 
@@ -143,10 +151,9 @@ def read(remote: Remote) -> bytes:
 
 def read_tagged(remote: Remote) -> tuple[bytes, str]:
     """The content of an object and the tag of this content."""
-    store = _of(remote)
-    import obstore
+    with _opened(remote, "read") as store:
+        import obstore
 
-    with _one_line(remote, "read"):
         found = obstore.get(store, remote.key)
         return bytes(found.bytes()), str(found.meta[_condition(remote)])
 
@@ -162,12 +169,19 @@ def size_and_tag(remote: Remote) -> tuple[int, str]:
     Raises:
         Missing: there is none.
     """
-    store = _of(remote)
-    import obstore
+    with _opened(remote, "read") as store:
+        import obstore
 
-    with _one_line(remote, "read"):
         meta = obstore.head(store, remote.key)
         return int(meta["size"]), str(meta["e_tag"])
+
+
+def written(remote: Remote) -> date:
+    """The day on which an object was written, in UTC."""
+    with _opened(remote, "read") as store:
+        import obstore
+
+        return obstore.head(store, remote.key)["last_modified"].date()
 
 
 def exists(remote: Remote) -> bool:
@@ -181,10 +195,9 @@ def exists(remote: Remote) -> bool:
 
 def read_range(remote: Remote, start: int, length: int) -> bytes:
     """A part of an object."""
-    store = _of(remote)
-    import obstore
+    with _opened(remote, "read") as store:
+        import obstore
 
-    with _one_line(remote, "read"):
         return bytes(obstore.get_range(store, remote.key, start=start, length=length))
 
 
@@ -193,22 +206,20 @@ def read_ranges(remote: Remote, ranges: Iterable[tuple[int, int]]) -> list[bytes
     wanted = [(start, length) for start, length in ranges if length > 0]
     if not wanted:
         return []
-    store = _of(remote)
     import obstore
 
     starts, lengths = [start for start, _ in wanted], [length for _, length in wanted]
-    with _one_line(remote, "read"):
+    with _opened(remote, "read") as store:
         found = obstore.get_ranges(store, remote.key, starts=starts, lengths=lengths, coalesce=0)
         return [bytes(part) for part in found]
 
 
 def write(remote: Remote, data: bytes | Path | Iterable[bytes]) -> None:
     """Write an object whole: nobody sees a part of it."""
-    store = _of(remote)
-    import obstore
+    with _opened(remote, "write") as store:
+        import obstore
 
-    with _one_line(remote, "write"):
-        obstore.put(store, remote.key, data)
+        obstore.put(store, remote.key, data, max_concurrency=PARTS_AT_ONCE)
 
 
 def create(remote: Remote, data: bytes) -> None:
@@ -237,10 +248,9 @@ def _conditional(remote: Remote, data: bytes, tag: str | None) -> None:
         if remote.scheme == "file":
             _exchange_file(remote, data, tag)
             return
-        store = _of(remote)
-        import obstore
+        with _opened(remote, "write") as store:
+            import obstore
 
-        with _one_line(remote, "write"):
             mode: Any = "create" if tag is None else {_condition(remote): tag}
             obstore.put(store, remote.key, data, mode=mode, use_multipart=False)
     except (Changed, Unreachable):
@@ -253,7 +263,7 @@ def _conditional(remote: Remote, data: bytes, tag: str | None) -> None:
 def _exchange_file(remote: Remote, data: bytes, tag: str | None) -> None:
     """The same on a file system, which has no such request: under a lock of the folder."""
     folder = Path("/") / Path(remote.key).parent
-    with _one_line(remote, "write"):
+    with _opened(remote, "write"):
         folder.mkdir(parents=True, exist_ok=True)
     try:
         held = FolderLock(folder, "try again")
@@ -275,11 +285,10 @@ def listed(remote: Remote) -> list[tuple[str, int, str]]:
     Raises:
         StereoSfmError: there is no such bucket, or no right to list it.
     """
-    store = _of(remote)
     import obstore
 
     prefix = f"{remote.key}/" if remote.key else ""
-    with _one_line(remote, "list"):
+    with _opened(remote, "list") as store:
         found = [m for page in obstore.list(store, prefix=prefix or None) for m in page]
     rows = [(str(m["path"]).removeprefix(prefix), int(m["size"]), str(m["e_tag"])) for m in found]
     return sorted(row for row in rows if row[0])
@@ -287,19 +296,18 @@ def listed(remote: Remote) -> list[tuple[str, int, str]]:
 
 def folders(remote: Remote) -> list[str]:
     """The names of the folders in a folder."""
-    store = _of(remote)
     import obstore
 
     prefix = f"{remote.key}/" if remote.key else ""
-    with _one_line(remote, "list"):
+    with _opened(remote, "list") as store:
         found = obstore.list_with_delimiter(store, prefix=prefix or None)["common_prefixes"]
     return sorted(str(name).rstrip("/").rpartition("/")[2] for name in found)
 
 
 def delete(remotes: Iterable[Remote]) -> None:
     """Remove objects; those that are gone already are as good."""
-    import obstore
-
     for remote in remotes:
-        with contextlib.suppress(Missing), _one_line(remote, "delete"):
-            obstore.delete(_of(remote), remote.key)
+        with contextlib.suppress(Missing), _opened(remote, "delete") as store:
+            import obstore
+
+            obstore.delete(store, remote.key)

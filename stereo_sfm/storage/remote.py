@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PosixPath
 from urllib.parse import unquote
 
 from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 SCHEMES = ("s3", "gs", "az", "file")
+_BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_COLLAPSED = re.compile(rf"({'|'.join(SCHEMES)}):/")
 _URI = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.*)", re.DOTALL)
 
 
@@ -46,7 +48,12 @@ class Remote:
             return Remote(scheme, "", unquote(key).strip("/"))
         if not bucket:
             raise StereoSfmError(f"{uri} names no bucket: write {scheme}://BUCKET/KEY")
-        return Remote(scheme, bucket, key.strip("/"))
+        if not _BUCKET.fullmatch(bucket):
+            raise StereoSfmError(f"'{bucket}' is no name of a bucket: letters, digits, dots, '-' and '_'")
+        key = key.strip("/")
+        if key and {"", ".", ".."} & set(key.split("/")):
+            raise StereoSfmError(f"{uri} has an empty name or dots between two slashes")
+        return Remote(scheme, bucket, key)
 
     def __str__(self) -> str:
         return f"{self.scheme}://{self.bucket}/{self.key}"
@@ -71,6 +78,20 @@ class Remote:
 
 
 Place = Path | Remote
+
+
+class InputPath(PosixPath):
+    """The path of what a command reads: it may also be an address."""
+
+
+def of_path(path: Path) -> Remote | None:
+    """The address that was taken for a path, which has lost one of its slashes; None: it is a path.
+
+    Raises:
+        StereoSfmError: as `Remote.of`.
+    """
+    found = _COLLAPSED.match(str(path))
+    return Remote.of(f"{found[1]}://{str(path)[found.end() :]}") if found else None
 
 
 def is_uri(text: str) -> bool:

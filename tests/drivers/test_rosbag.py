@@ -7,13 +7,15 @@ import json
 import logging
 import shutil
 import sqlite3
+import tempfile
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import zstandard
-from rosbags import rosbag1
+from rosbags import rosbag1, rosbag2
 
 from stereo_sfm.cli import main
 from stereo_sfm.drivers import open_source
@@ -238,6 +240,51 @@ def test_compressed_bags_are_read_up_to_a_limit(kind: str, tmp_path: Path, monke
             np.testing.assert_array_equal(a.left, b.left)
     monkeypatch.setattr(unpacked, "MAX_BYTES", 10_000)
     assert "is damaged: a compressed part has more than 10000 bytes" in _error_of(path)
+
+
+def _compressed(path: Path, mode: rosbag2.CompressionMode, plugin: rosbag2.StoragePlugin) -> Path:
+    """A copy of a folder's bag."""
+    writer = rosbag2.Writer(path.with_name("compressed"), version=9, storage_plugin=plugin)
+    writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    with rosbag2.Reader(path) as reader, writer:
+        of = {
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+            for c in reader.connections
+        }
+        for connection, time_ns, data in reader.messages():
+            writer.write(of[connection.id], time_ns, data)
+    return writer.path
+
+
+def test_files_that_are_compressed_as_wholes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    source, images = _simulated()
+    path = write_bag(tmp_path, KINDS[0], source.rig, images)
+    path = _compressed(path, rosbag2.CompressionMode.FILE, rosbag2.StoragePlugin.SQLITE3)
+    before = set(tmp_path.iterdir())
+    with open_source(path) as bag:
+        for a, b in zip(bag, images, strict=True):
+            np.testing.assert_array_equal(a.left, b.left)
+        assert len(set(tmp_path.iterdir()) - before) == 1
+    assert set(tmp_path.iterdir()) == before
+    monkeypatch.setattr(unpacked.shutil, "disk_usage", lambda _: SimpleNamespace(free=2_000))
+    assert "more than 0.0 MB; temporary files are in TMPDIR" in _error_of(path)
+    monkeypatch.undo()
+    name = next(path.glob("*.zstd"))
+    name.write_bytes(zstandard.compress(bytes(50_000_000)))
+    assert "unpacked, a file would have more than 0." in _error_of(path)
+    name.unlink()
+    assert f"its file {name.name} is missing" in _error_of(path)
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_a_bomb_in_an_mcap_file_of_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, KINDS[2], source.rig, images)
+    path = _compressed(path, rosbag2.CompressionMode.STORAGE, rosbag2.StoragePlugin.MCAP)
+    assert _error_of(path) == ""
+    monkeypatch.setattr(unpacked, "MAX_BYTES", 10_000)
+    assert "a compressed part has more than 10000 bytes" in _error_of(path)
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,9 @@ def test_a_cell_is_run_judged_and_kept(tmp_path: Path) -> None:
     assert row["rel trans mean [m]"] < 0.05
     save_result(tmp_path / "x.json", result)
     assert load_result(tmp_path / "x.json") == json.loads(json.dumps(result))
+    damaged = (tmp_path / "x.json").read_text().replace('"frames": 5', '"frames": "5"')
+    (tmp_path / "x.json").write_text(damaged)
+    assert load_result(tmp_path / "x.json") is None
     (tmp_path / "x.json").write_text('{"schema": 1, "cel')
     assert load_result(tmp_path / "x.json") is None
 

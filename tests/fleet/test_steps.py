@@ -10,13 +10,15 @@ import pytest
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export import store_plan
 from stereo_sfm.fleet.catalogue import ask, opened
 from stereo_sfm.fleet.copies import fetch_version
-from stereo_sfm.fleet.plan import Plan, Walk, find_walks, load_plan
+from stereo_sfm.fleet.plan import Plan, Walk, find_walks, load_plan, night_of
 from stereo_sfm.fleet.run import forget_images, jobs_of
 from stereo_sfm.fleet.steps import update_store
 from stereo_sfm.fleet.versions import current, roll_back
 from stereo_sfm.jobs import Job, Result
+from stereo_sfm.maps import put_session as put_session_module
 from stereo_sfm.maps.put_session import put_session
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.storage import objects
@@ -135,6 +137,60 @@ def test_old_recordings_are_deleted_once_their_map_is_made(plan: Plan, session: 
         assert ask(connection, "SELECT count(*) FROM walks")[1] == "1"
 
 
+def test_old_recordings_without_a_date_or_an_end_are_deleted_too(plan: Plan, session: Path) -> None:
+    send_folder(session, walks(plan) / "r1" / "evening")
+    objects.write(walks(plan) / "r1" / "00001_2026-11-25_220000" / "00000_000000.images.mcap", b"...")
+    carry_out(plan)
+    found, waiting = find_walks(plan)
+    assert forget_images(plan, found, datetime.date(2026, 11, 26), waiting) == 0
+    later = datetime.date.today() + datetime.timedelta(400)
+    assert forget_images(plan, found, later, waiting) > 3 and find_walks(plan) == ([], [])
+
+
+def test_a_damaged_step_is_made_again(plan: Plan, session: Path) -> None:
+    """Between the steps of a night, the session's map is damaged in the bucket."""
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    (made,) = carry_out(plan, only=1).values()
+    points = Remote.of(made["session"]) / "points.npz"
+    whole = objects.read(points)
+    objects.write(points, whole[:100])
+    night = carry_out(plan)[f"{STORE} 2026-11-25"]
+    assert "it is made again next time" in night["failed"]["r1/2026-11-25_2200"]
+    night = carry_out(plan)[f"{STORE} 2026-11-25"]
+    assert night["version"] == 1 and not night["failed"]
+
+
+def test_an_error_of_ours_stops_no_night(plan: Plan, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    save_map(small_map(seed=3)[1], session.parent / "another")
+    send_folder(session.parent / "another", walks(plan) / "r2" / "2026-11-25_2200")
+    put, failed = put_session_module.put_session, list[str]()
+
+    def fails_once(folder: Path, saved: object, name: str, *rest: object, **more: object) -> object:
+        if not failed:
+            failed.append(name)
+            raise LookupError("of ours")
+        return put(folder, saved, name, *rest, **more)  # type: ignore[arg-type]
+
+    def no_plan(_: Path) -> None:
+        raise StereoSfmError("too few points")
+
+    monkeypatch.setattr(put_session_module, "put_session", fails_once)
+    monkeypatch.setattr(store_plan, "write_store_plan", no_plan)
+    night = carry_out(plan)[f"{STORE} 2026-11-25"]
+    assert night["version"] == 1 and night["failed"] == {failed[0]: "of ours"}
+    assert "no floor plan: too few points" in current(plan.root / STORE / "map").changes
+    night = carry_out(plan)[f"{STORE} 2026-11-25"]
+    assert night["version"] == 2 and not night["failed"]
+
+
+@pytest.mark.parametrize(
+    ("name", "night"), [("2026-13-45_x", "undated"), ("a_2026-13-45_2026-11-25", "2026-11-25"), ("x", "undated")]
+)
+def test_a_night_is_a_date(name: str, night: str) -> None:
+    assert night_of(name) == night
+
+
 def test_the_report_names_what_failed(
     plan: Plan, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -158,6 +214,10 @@ def test_the_report_names_what_failed(
         ('[fleet]\nroot = "s9://x"', "unknown scheme"),
         ('[fleet]\nrot = "s3://x"', "did you mean root"),
         ('[fleet]\nroot = "s3://x"\n[[walk]]\nstore = "a"', r"each \[\[walk\]\] has the texts"),
+        (
+            '[fleet]\nroot = "s3://x"\n[[walk]]\nstore = "a"\nnight = "x"\nrobot = "r"\nsource = "sim:loop"',
+            "is a date such as 2026-11-25",
+        ),
     ],
 )
 def test_a_wrong_plan_is_one_line(text: str, said: str, tmp_path: Path) -> None:

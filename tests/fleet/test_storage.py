@@ -11,7 +11,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_folder
-from stereo_sfm.storage.objects import Missing
+from stereo_sfm.storage.objects import Missing, Unreachable
 from stereo_sfm.storage.remote import Remote, place
 from stereo_sfm.storage.stream import PAGE, RangeStream
 from tests.fleet.s3_server import READER, Server
@@ -27,6 +27,9 @@ from tests.maps.maps import small_map
         ("s3://", "names no bucket"),
         ("s3://key:secret@bucket/x", "no credentials in an address"),
         ("file://host/x", "begins with three slashes"),
+        ("s3://my bucket/x", "no name of a bucket"),
+        ("s3://bucket/a//b", "an empty name or dots"),
+        ("s3://bucket/a/../b", "an empty name or dots"),
     ],
 )
 def test_a_wrong_address_is_one_line(uri: str, text: str) -> None:
@@ -52,6 +55,25 @@ def test_failures_are_one_line(place: str, s3: Server, monkeypatch: pytest.Monke
     with pytest.raises(StereoSfmError, match="no right to write") as error:
         objects.write(Remote.of(place) / "x", b"2")
     assert "the-secret" not in str(error.value) and READER not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["401", "507", "credential"])
+def test_the_name_of_an_object_says_nothing_about_its_server(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    for key, value in (("ENDPOINT_URL", "http://127.0.0.1:9"), ("ACCESS_KEY_ID", "a"), ("SECRET_ACCESS_KEY", "b")):
+        monkeypatch.setenv(f"AWS_{key}", value)
+    objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    with objects.patience(1.0), pytest.raises(Unreachable, match="no answer"):
+        objects.read(Remote.of(f"s3://bucket/{name}"))
+    objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+
+
+def test_missing_credentials_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AZURE_STORAGE_ACCOUNT_NAME", raising=False)
+    with pytest.raises(StereoSfmError, match=r"no credentials for az://: .*AZURE_STORAGE_ACCOUNT_NAME"):
+        objects.read(Remote.of("az://bucket/x"))
+    monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "/nowhere.json")
+    with pytest.raises(StereoSfmError, match="no credentials for gs://"):
+        objects.read(Remote.of("gs://bucket/x"))
 
 
 def test_one_of_many_writers_wins(place: str) -> None:
@@ -127,12 +149,28 @@ def test_a_pace_is_kept(tmp_path: Path) -> None:
         ["info", "s5://b/x.mcap"],
         ["run", "s3://absent/x.mcap", "--inline"],
         ["map", "versions", "s3://absent/store"],
+        ["batch", "sim:aisle", "-o", "s3://absent/runs"],
+        ["map", "merge", "s3://absent/a", "s3://absent/b", "-o", "out"],
         ["record", "sim:aisle?size=96x80&frames=2", "-o", "s3://absent/x.mcap", "-q"],
     ],
 )
 def test_commands_say_it_in_one_line(arguments: list[str], s3: Server, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == StereoSfmError.exit_code
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_what_is_read_may_be_in_a_bucket(
+    place: str, s3: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STEREO_SFM_CACHE", str(tmp_path / "cache"))
+    save_map(small_map()[1], tmp_path / "map")
+    assert main(["map", "info", str(tmp_path / "map")]) == 0
+    said = capsys.readouterr().out
+    send_folder(tmp_path / "map", Remote.of(place) / "map")
+    assert main(["map", "info", f"{place}/map"]) == 0
+    assert capsys.readouterr().out.replace(str(tmp_path / "cache"), "").count("keyframes") == said.count("keyframes")
+    assert main(["export", f"{place}/map", "--format", "ply", "-o", str(tmp_path / "points.ply")]) == 0
+    assert (tmp_path / "points.ply").stat().st_size > 1000
 
 
 def test_no_right_to_write_is_one_line(

@@ -133,6 +133,31 @@ def test_a_rolled_back_session_is_not_put_in_again(place: str, tmp_path: Path) -
         roll_back(store)
 
 
+def test_robots_that_were_given_a_version_lose_it_when_it_is_rolled_back(place: str, tmp_path: Path) -> None:
+    store = Remote.of(place)
+    for night in (0, 1):
+        publish_night(store, tmp_path / "made", night)
+    release(store, 2)
+    release(store, 1, ("r7",))
+    release(store, 2, ("r8",))
+    assert roll_back(store).number == 1
+    assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [1, 1, 1]
+    publish_night(store, tmp_path / "made", 2)
+    assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [3, 1, 3]
+
+
+@pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", ""])
+def test_a_version_names_no_file_outside(name: str, place: str, tmp_path: Path) -> None:
+    store = Remote.of(place)
+    publish_night(store, tmp_path / "made", 0)
+    manifest = store / current(store).name
+    data = json.loads(objects.read(manifest))
+    data["files"][name] = next(iter(data["files"].values()))
+    objects.write(manifest, json.dumps(data).encode())
+    with pytest.raises(StereoSfmError, match="is damaged, or is no store"):
+        current(store)
+
+
 def test_a_version_is_released_to_some_robots_first(place: str, tmp_path: Path) -> None:
     store = Remote.of(place)
     for night in (0, 1, 2):

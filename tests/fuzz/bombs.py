@@ -105,6 +105,14 @@ def _huge_index(source: Path) -> bytes:
     return bytes(raw)
 
 
+def _holes(path: Path, index: bool) -> None:
+    """A closed file with a schema of 3 GiB that takes no disk; it is all of the index, or stands before it."""
+    with path.open("wb") as out:
+        out.write(MCAP0_MAGIC + struct.pack("<BQ", Opcode.SCHEMA, 3 * GIB))
+        out.seek(3 * GIB, io.SEEK_CUR)
+        out.write(struct.pack("<BQQQI", Opcode.FOOTER, 20, len(MCAP0_MAGIC) * index, 0, 0) + MCAP0_MAGIC)
+
+
 def recordings(folder: Path, sources: list[Path]) -> list[Case]:
     """Chunks, indexes and attachments of MCAP files."""
     own = sources[0]
@@ -146,6 +154,10 @@ def recordings(folder: Path, sources: list[Path]) -> list[Case]:
         path = folder / f"r{i}.mcap"
         path.write_bytes(data)
         cases += [(name, ["info", str(path)]), (name, ["recover", str(path), "-o", str(folder / f"m{i}.mcap")])]
+    for name, index in (("holes", False), ("an index of holes", True)):
+        path = folder / f"h{index:d}.mcap"
+        _holes(path, index)
+        cases += [(name, ["info", str(path)]), (name, ["recover", str(path), "-o", str(folder / f"mh{index:d}.mcap")])]
     for i, (name, (kind, data)) in enumerate(attached.items()):
         path = folder / f"a{i}.mcap"
         _with_attachment(path, own, kind, data)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
 import sys
 import time
 from dataclasses import replace
 
 import psutil
+import pytest
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import MadeSource
@@ -54,10 +57,11 @@ def test_a_standby_loads_what_opening_the_source_takes() -> None:
     assert "colorsys" in sys.modules
 
 
-def test_a_standby_that_died_is_known_and_ends() -> None:
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_standby_that_died_or_was_stopped_is_known_and_ends(fault: signal.Signals) -> None:
     standby = Standby(Config(), SlidingWall(1).rig)
     pids = standby.stages.pids
-    psutil.Process(pids["tracker"]).kill()
+    os.kill(pids["tracker"], fault)
     until = time.monotonic() + 60.0
     while standby.alive:
         assert time.monotonic() < until
@@ -66,3 +70,16 @@ def test_a_standby_that_died_is_known_and_ends() -> None:
     for process in standby.stages.processes.values():
         process.join(60.0)
     assert not any(psutil.pid_exists(pid) for pid in pids.values())
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_poses_may_come_before_the_map(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot may be moving while its pipeline starts again."""
+    run, asked = ProcessRun(MadeSource.of(SlidingWall, 1), Config(), pose_first=first), list[tuple[str, object]]()
+    monkeypatch.setattr(type(run._stages), "request", lambda _, *given: asked.append(given))  # pyright: ignore[reportPrivateUsage]
+    run._live, run._not_ready = True, {"tracker", "mapper", "loop", "optimizer"}  # pyright: ignore[reportPrivateUsage]
+    run._begin("tracker")  # pyright: ignore[reportPrivateUsage]
+    assert (("capture", "go") in asked) == first
+    for stage in ("mapper", "loop", "optimizer"):
+        run._begin(stage)  # pyright: ignore[reportPrivateUsage]
+    assert asked.count(("capture", "go")) == 1

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.whole_file import WholeFile
 from stereo_sfm.recording import upload
 from stereo_sfm.recording.quota import Disk, Quota, make_room
 from stereo_sfm.recording.segments import RECORDING, SENT, Segment, new_recording, recordings, sent_whole
@@ -61,6 +62,16 @@ def test_each_file_is_sent_once_and_the_sums_last(tmp_path: Path, bucket: Bucket
     assert after.send_all() == 2 and after.send_all() == 0
     assert sent_whole(segments[0].folder) and bucket.sent[-1] == SENT and RECORDING in bucket.sent
     assert len(bucket.sent) == len(set(bucket.sent))
+
+
+def test_what_another_process_writes_waits(tmp_path: Path, bucket: Bucket) -> None:
+    """`fleet upload` beside a running service; and a recorder that goes on while its last file is closed."""
+    segments = recorded(tmp_path)
+    segments[-1].images.unlink()
+    writing = WholeFile(segments[-1].images, overwrite=False)
+    assert Uploader(tmp_path, TO).send_all() == 4 and SENT not in bucket.sent
+    writing.finish()
+    assert Uploader(tmp_path, TO).send_all() == 2 and bucket.sent[-1] == SENT
 
 
 def test_a_failure_goes_on_where_it_stopped(tmp_path: Path, bucket: Bucket) -> None:

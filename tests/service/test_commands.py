@@ -17,7 +17,7 @@ from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
 from tests.service.test_service import wait_for
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("beside")]
 
 
 class Watched:

@@ -237,6 +237,17 @@ def test_nobody_without_the_token_is_served() -> None:
         output.close()
 
 
+def test_who_guesses_tokens_waits() -> None:
+    output = FoxgloveOutput(FoxgloveConfig(port=0), Access(TOKEN))
+    output.open(FakeService())
+    try:
+        answers = [_refused(output, Authorization=f"Bearer guess {i}") for i in range(40)]
+        assert set(answers) == {401, 429} and answers.count(429) >= 32
+        assert _refused(output, Authorization=f"Bearer {TOKEN}") == 429  # the right one would be found by guessing
+    finally:
+        output.close()
+
+
 def test_a_client_that_does_not_read_delays_no_other() -> None:
     with _serving() as (output, client):
         known = _channels(client, len(KINDS) + 3)

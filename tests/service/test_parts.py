@@ -336,3 +336,13 @@ def test_a_recorder_that_dies_at_its_start_is_not_started_all_the_time(monkeypat
     time.sleep(0.2)
     assert 3 <= len(started) <= 5  # at 0, 0.1, 0.3 and 0.7 s
     assert threading.active_count() <= before + 1
+
+
+@pytest.mark.parametrize("recording", [False, True])
+def test_a_recorder_with_nothing_to_write_is_not_missed(recording: bool, caplog: pytest.LogCaptureFixture) -> None:
+    process = SimpleNamespace(join=lambda *_: None, is_alive=lambda: True, kill=lambda: None)
+    recorder = Recorder(RecordingConfig())
+    recorder._process = cast(Any, process)  # pyright: ignore[reportPrivateUsage]
+    recorder.state = dataclasses.replace(recorder.state, recording=recording)
+    recorder.close()
+    assert ("did not end in time" in caplog.text) == recording

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import json
 import math
 import re
@@ -26,7 +27,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.log import schema
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.outputs import pose_socket
-from stereo_sfm.service.outputs.access import Access, access
+from stereo_sfm.service.outputs.access import WRONG_AT_ONCE, Access, access
 from stereo_sfm.service.outputs.pose_message import MISSED_FIELD, PoseMessage
 from stereo_sfm.service.outputs.pose_socket import MOST_CLIENTS, Place, PoseSocket
 from stereo_sfm.service.outputs.settings import OutputsConfig, PoseSocketConfig, SecurityConfig
@@ -90,6 +91,18 @@ def test_a_pose_is_a_line_in_the_axes_of_robots() -> None:
     assert pose["twist"] == pytest.approx([0.5, 0, 0, 0, 0, 0.1])
     assert 12 <= pose["latency_ms"] < 200 and pose["missed"] == 0
     assert (pose["frame_id"], pose["state"], pose["tracked"], pose["session"]) == (7, "OK", True, 1)
+
+
+def test_who_guesses_tokens_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules, looked_at = Access(TOKEN), list[str]()
+    compare = hmac.compare_digest
+    monkeypatch.setattr(hmac, "compare_digest", lambda *two: looked_at.append(two[0]) or compare(*two))
+    with _listening(rules=rules) as output:
+        for i in range(40):
+            with socket.create_connection(("127.0.0.1", output.port), 5) as client:
+                client.sendall(f"guess {i}\n".encode())
+                assert client.recv(1) == b""
+    assert WRONG_AT_ONCE <= len(looked_at) <= WRONG_AT_ONCE + 3
 
 
 def test_a_calibrated_body_is_the_robot() -> None:

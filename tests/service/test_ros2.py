@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,13 +13,16 @@ import numpy as np
 import pytest
 
 from stereo_sfm.geometry import se3
+from stereo_sfm.service.config import RobotConfig
+from stereo_sfm.service.link import OutputProcess
 from stereo_sfm.service.messages import ServiceState
-from stereo_sfm.service.outputs import ros2
+from stereo_sfm.service.outputs import dds_memory, ros2
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.ros2 import SERVICES, Ros2Output
 from stereo_sfm.service.outputs.settings import Ros2Config
 from stereo_sfm.service.publisher import Reply
 from tests.service.service_messages import NAN6, FakeService, cloud, health, live_depth, pose_update, started, status
+from tests.service.test_service import wait_for
 from tests.synthetic import pinhole_rig
 
 rclpy = pytest.importorskip("rclpy")
@@ -215,3 +220,22 @@ def test_transforms_lead_from_the_map_to_the_robot_and_its_cameras() -> None:
         ("base_link", ros2.LEFT_FRAME),
         (ros2.LEFT_FRAME, ros2.RIGHT_FRAME),
     ]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("beside")
+def test_nothing_is_left_in_shared_memory() -> None:
+    """Whether the output is killed, or ends with the service beside busy loops."""
+    dds_memory.sweep()
+    before = set(dds_memory.SHARED.glob("*fast*"))
+    output = OutputProcess("ros2", RobotConfig(), lambda *_: Reply(True, ""))
+    output.start()
+
+    def started(times: int) -> bool:
+        return bool(output.wants and output.starts == times and set(dds_memory.SHARED.glob("*fast*")) - before)
+
+    wait_for(lambda: started(1) and output.pid is not None)
+    os.kill(output.pid or 0, signal.SIGKILL)
+    wait_for(lambda: started(2))
+    output.close()
+    assert set(dds_memory.SHARED.glob("*fast*")) <= before

@@ -7,11 +7,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
 
+from stereo_sfm.cli import main
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.saved_map import load_map
@@ -48,7 +50,24 @@ def test_pipelines_go_first_and_outputs_do_not(monkeypatch: pytest.MonkeyPatch, 
     assert raised == ["pipelines"]
 
 
+def test_nobody_else_reads_what_serve_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    masks = list[int]()
+
+    def service(_: RobotConfig) -> Service:
+        masks.append(os.umask(0))
+        raise StereoSfmError("enough")
+
+    monkeypatch.setattr(service_module, "Service", service)
+    before = os.umask(0o022)
+    try:
+        assert main(["serve", "sim:loop"]) == StereoSfmError.exit_code
+    finally:
+        os.umask(before)
+    assert masks == [0o027]
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("beside")
 def test_a_session_its_map_and_the_next_one(tmp_path: Path) -> None:
     poses, states = list[PoseUpdate](), list[Status]()
     with Service(config(tmp_path), MadeSource.of(endless_wall)) as service:
@@ -77,23 +96,28 @@ def test_a_session_its_map_and_the_next_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("beside")
 @pytest.mark.parametrize(
     ("what", "stage"), [(signal.SIGKILL, "tracker"), (signal.SIGKILL, "capture"), (signal.SIGSTOP, "mapper")]
 )
 def test_a_dead_or_hung_stage_costs_seconds(what: signal.Signals, stage: str, tmp_path: Path) -> None:
     poses, sessions = list[PoseUpdate](), list[Started]()
-    with Service(config(tmp_path), MadeSource.of(endless_wall)) as service:
+    settings = replace(config(tmp_path), recording=RecordingConfig(str(tmp_path / "recordings"), "full", "raw"))
+    with Service(settings, MadeSource.of(endless_wall)) as service:
         service.on(PoseUpdate, poses.append)
         service.on(Started, sessions.append)
-        wait_for(lambda: len(poses) > 60)
+        wait_for(lambda: len(poses) > 60 and "recorder" in service.pids)
         assert service.save_map().ok
+        recorder = service.pids["recorder"]
         os.kill(service.pids[stage], what)
         wait_for(lambda: len(sessions) == 2)
         wait_for(lambda: poses[-1].session == 2 and poses[-1].localized)
         assert service.status().data["health"]["restarts"] == 1
+        assert service.pids["recorder"] == recorder  # it goes on
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("beside")
 def test_the_end_of_a_recording_ends_the_service_with_its_map_saved(tmp_path: Path) -> None:
     from tests.pipeline.test_pipeline import SlidingWall
 

@@ -33,7 +33,7 @@ from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
 from tests.service.test_service import PATIENCE_S, STOP_S, wait_for
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("beside")]
 DEMO = Path(__file__).parents[2] / "recordings" / "demo.mcap"
 
 
@@ -91,6 +91,19 @@ def test_a_killed_loop_closer_costs_no_session(tmp_path: Path) -> None:
         watched.more_poses(60)
         assert watched.no_pose_is_missing()
         assert watched.service.status().data["health"]["restarts"] == 0
+
+
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_dead_or_stopped_map_saver_is_replaced(fault: signal.Signals, tmp_path: Path) -> None:
+    with running(config(tmp_path)):
+        pass
+    with running(config(tmp_path)) as watched:
+        wait_for(lambda: "map saver" in watched.service.pids)
+        os.kill(watched.service.pids["map saver"], fault)
+        wait_for(lambda: watched.service.save_map().ok)
+        watched.more_poses()
+        assert watched.no_pose_is_missing()
+    assert load_map(tmp_path / "store").session_ids == [0, 1]
 
 
 def test_a_stage_that_gets_no_memory_is_started_again(tmp_path: Path) -> None:

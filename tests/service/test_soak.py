@@ -33,5 +33,7 @@ def test_what_a_process_keeps_is_told_from_what_its_jobs_need() -> None:
 
 @pytest.mark.slow
 def test_five_minutes_of_everything(tmp_path: Path) -> None:
-    options = {"minutes": "5", "times": "2", "kills": "1", "source": "sim:loop?size=424x400&frames=300"}
-    assert main([*(f"--{name}={value}" for name, value in options.items()), f"--work={tmp_path}"]) == 0
+    """Four of them by the clock: with and without attacks, and both beside busy loops."""
+    options = {"minutes": "5", "realtime": "4", "source": "sim:loop?size=424x400&frames=300"}
+    given = [f"--{name}={value}" for name, value in options.items()]
+    assert main([*given, "--attacks", f"--work={tmp_path}"]) == 0

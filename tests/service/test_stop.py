@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import atexit
+import fcntl
 import threading
 import time
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,10 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.messages import MapSaved
 from stereo_sfm.pipeline.processes import END_S, IN_FLIGHT_S, SAVE_END_S, ProcessRun
-from stereo_sfm.service import child, link, service
+from stereo_sfm.service import link, service
 from stereo_sfm.service.config import MapConfig, RobotConfig
 from stereo_sfm.service.link import OutputProcess
-from stereo_sfm.service.outputs import OUTPUTS, TIDY
+from stereo_sfm.service.outputs import dds_memory
 from stereo_sfm.service.publisher import Reply
 from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
@@ -112,17 +111,16 @@ def test_recorder_and_outputs_end_while_the_map_is_still_written(
     assert waited == [True]
 
 
-def ends(mark: str, tidy: bool, to_service: Connection) -> None:
-    """In a child whose library has something to remove at the interpreter's exit."""
-    atexit.register(Path(mark).touch)
-    child.TIDY_S = PATIENCE_S  # the test may share a busy computer
-    child.run_child("an output", to_service, lambda _: None, tidy)
-
-
-@pytest.mark.parametrize("tidy", [False, True])
-def test_libraries_of_an_output_clean_up_at_its_end_if_they_do_that_in_time(tmp_path: Path, tidy: bool) -> None:
-    """ROS 2 has files in shared memory; what others leave is closed by the system."""
-    process = child.start_child("an output", ends, str(tmp_path / "removed"), tidy, child.pipe()[1])
-    process.join(PATIENCE_S)
-    assert process.exitcode == 0 and (tmp_path / "removed").exists() == tidy
-    assert OUTPUTS.keys() >= TIDY >= {"ros2"}
+def test_shared_memory_of_dds_that_nobody_uses_is_removed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(dds_memory, "SHARED", tmp_path)
+    used = ["fastrtps_port7000", "fastrtps_port7000_el", "sem.fastrtps_port7000_mutex"]
+    left = ["fastrtps_0a1b", "fastrtps_0a1b_el", "fastrtps_port7411", "fastrtps_port7411_el"]
+    others = ["stereo_sfm_ring_1", "fast_el", "sem.another"]
+    for name in (*used, *left, "sem.fastrtps_port7411_mutex", *others):
+        (tmp_path / name).touch()
+    with (tmp_path / "fastrtps_port7000_el").open("r+b") as held:
+        fcntl.flock(held, fcntl.LOCK_SH)  # a port that several processes read
+        dds_memory.sweep()
+        assert {path.name for path in tmp_path.iterdir()} == {*used, *others}
+    dds_memory.sweep()
+    assert {path.name for path in tmp_path.iterdir()} == set(others)

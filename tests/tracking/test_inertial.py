@@ -13,6 +13,7 @@ from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.source import open_source
+from stereo_sfm.eval.smoothing import smooth_bridges
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.preintegration import GRAVITY
@@ -20,7 +21,6 @@ from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.inertial.series import SampleBuffer
-from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import F64, I64, Bool, ImuSamples, StereoImage, TrackState
 
 RATE_NS, FRAME_NS = 5_000_000, 50_000_000

@@ -10,4 +10,3 @@ OUTPUTS: dict[str, str] = {
     "foxglove": "stereo_sfm.service.outputs.foxglove_server:make",
     "page": "stereo_sfm.service.page.server:make",
 }
-TIDY = frozenset({"ros2"})  # whose libraries remove what they have in shared memory at the interpreter's exit

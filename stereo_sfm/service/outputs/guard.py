@@ -12,6 +12,7 @@ from urllib.parse import parse_qs
 from h11 import LocalProtocolError
 from starlette.responses import JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.utils import ClientDisconnected
 
 from stereo_sfm.service.outputs.access import Access, TooManyAttempts
 from stereo_sfm.service.outputs.door import UNREAD_S, Door, Visit
@@ -23,6 +24,7 @@ SAFE = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cache-control": "no-store",
+    "cross-origin-resource-policy": "same-origin",
 }
 MOST_KINDS = 64  # of failures that are logged
 
@@ -73,7 +75,7 @@ class Guard:
                 await refusal(503, "the service has ended")(scope, receive, answer.send)
             elif scope["type"] == "http":
                 await send({"type": "http.response.body"})
-        except OSError:  # the client has gone away, or does not read
+        except (ConnectionError, TimeoutError, ClientDisconnected):  # the client has gone away, or does not read
             if visit is not None:
                 visit.end()
         except Exception as error:

@@ -111,7 +111,7 @@ class _Client:
         self.visit, self.connection = visit, visit.socket
         self.pending = b""
         self.missed = 0
-        self._read_s = time.monotonic()  # when the system last took something
+        self._read_s = time.monotonic()  # when the system last had taken all
 
     def flush(self) -> bool:
         """Give the system what waits; False where it has no room.
@@ -122,7 +122,7 @@ class _Client:
         try:
             while self.pending:
                 self.pending = self.pending[self.connection.send(self.pending) :]
-                self._read_s = time.monotonic()
+            self._read_s = time.monotonic()
         except (BlockingIOError, InterruptedError, SSLWantReadError, SSLWantWriteError):
             if time.monotonic() - self._read_s > UNREAD_S:
                 raise TimeoutError("the client does not read") from None

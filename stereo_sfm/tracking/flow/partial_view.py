@@ -12,12 +12,11 @@ import numpy as np
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.follower import ReferenceImage
-from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL
+from stereo_sfm.tracking.flow.recovery import REACH, SUFFICIENT_RECALL
 from stereo_sfm.types import F64
 
 MORE_RECALL = 0.15  # by which more of the reference points must be found than before
 LASTS_NS = 1_000_000_000  # in which what covers the view has gone by, or stays
-CONTRADICTED_SIGMAS = 3.0  # between two positions of which one must be wrong
 
 
 class PartialView:
@@ -49,7 +48,7 @@ class PartialView:
         if recall < self._recall + MORE_RECALL:
             return False
         sigma_m = _sigma_m(covariance)
-        contradicted = not se3.within(before, after, CONTRADICTED_SIGMAS * math.hypot(sigma_m, self._sigma_m), math.inf)
+        contradicted = not se3.within(before, after, REACH * math.hypot(sigma_m, self._sigma_m), math.inf)
         return contradicted or sigma_m < self._sigma_m
 
     def end(self, recall: float) -> None:

@@ -19,7 +19,7 @@ from stereo_sfm.tracking.flow.visible_area import cells_of
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
-REACH = 3.0  # sigmas of the prediction within which hypotheses are accepted
+REACH = 3.0  # sigmas of a prediction within which a pose agrees with it
 NEAR = 0.4  # of the median distance of the newest keyframe's corners: nearer ones may be on an occluding object
 FADING = 0.9  # factor on the number of occupied cells from keyframe to keyframe
 UNCERTAIN_M = 0.2  # standard deviation of the predicted position from which other motions are tried

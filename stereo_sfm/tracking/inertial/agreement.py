@@ -15,6 +15,7 @@ from enum import IntEnum
 import numpy as np
 
 from stereo_sfm.calib.imu_fit import WRONG_OFFSET_MS, WRONG_ROTATION_DEG
+from stereo_sfm.tracking.inertial.inertial_filter import ROTATION_SIGMA
 from stereo_sfm.types import F64
 
 MEMORY_S = 20.0  # time constant with which what was seen is forgotten
@@ -22,7 +23,7 @@ FREEDOM = 10  # degrees of freedom left before anything is decided: then residua
 AGREED, KNOWN = 0.3, 0.1  # error of a quantity that agrees, and its standard deviation: not another axis, sign or unit
 TURNED = float(np.radians(WRONG_ROTATION_DEG[1]))  # error of rates that contradicts: what `check-calib` fails
 SIGMAS = 3.0  # of an error beyond those: less may be chance
-RATE_SIGMA, FORCE_SIGMA = 5e-4, 1e-3  # rad, m of a pose by images at best: less is not believed of residuals
+FORCE_SIGMA = 1e-3  # m of a pose by images at best: less is not believed of residuals
 
 
 class SensorUse(IntEnum):
@@ -71,7 +72,7 @@ class RateAgreement:
         freedom = 3 * self._n - 13
         if freedom < FREEDOM:
             return None
-        floor = 2 * (RATE_SIGMA * self._n / self._seconds) ** 2  # (rad/s)^2
+        floor = 2 * (ROTATION_SIGMA * self._n / self._seconds) ** 2  # (rad/s)^2
         variance, energy, axes, found = floor, np.ones(3), np.eye(3), np.eye(3)
         for _ in range(2):  # the second time with the noise that is left
             n = self._n + variance / self._bias_sigma**2

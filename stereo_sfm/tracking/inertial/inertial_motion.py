@@ -15,13 +15,12 @@ from stereo_sfm.tracking.inertial.agreement import ForceAgreement, RateAgreement
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
-from stereo_sfm.tracking.inertial.rotation_filter import RotationFilter
+from stereo_sfm.tracking.inertial.rotation_filter import JUDGED, RotationFilter
 from stereo_sfm.tracking.inertial.series import Intervals, SampleBuffer
 from stereo_sfm.types import F64, ImuSamples, InertialLink
 
 NODE_NS = 200_000_000  # between the poses of the filter
 MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
-JUDGED = 20  # intervals for the comparison with the images
 MISSING_S = 10.0  # between a pose and the newest sample: more is another clock
 LOOKED_AGAIN = 60  # intervals after which what is wrong is known better
 MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size

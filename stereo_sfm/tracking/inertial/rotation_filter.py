@@ -17,7 +17,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 DOUBTED_CHI2 = 11.3  # of three degrees of freedom: 99 %; beyond, one of them is wrong and counts less
-MOSTLY = 10  # of twice as many images contradict the gyroscope: it is wrong, not each of them
+JUDGED = 20  # images: when most of them contradict a sensor, it is wrong, not each of them
 WRONG_TURN = 0.01  # rad by which points that agree with each other do not err: so is a single jump of the gyroscope
 
 
@@ -26,7 +26,7 @@ class RotationFilter:
 
     def __init__(self) -> None:
         self._covariance: F64 | None = None  # (3, 3) of the last rotation, camera axes
-        self._contradicted: deque[bool] = deque(maxlen=2 * MOSTLY)
+        self._contradicted: deque[bool] = deque(maxlen=JUDGED)
         self.chi2 = 0.0  # of three: the newest rotation from images against the predicted one
 
     def restart(self) -> None:
@@ -50,7 +50,7 @@ class RotationFilter:
         self.chi2 = float(off @ information @ off)
         self._contradicted.append(self.chi2 > DOUBTED_CHI2)
         excess = max(self.chi2 / DOUBTED_CHI2, 1.0)
-        if sum(self._contradicted) > MOSTLY or off @ off > WRONG_TURN**2:
+        if sum(self._contradicted) > JUDGED // 2 or off @ off > WRONG_TURN**2:
             gain = covariance[:, 3:] @ information / excess
             self._covariance = covariance[3:, 3:] - gain[3:] @ covariance[3:, 3:]
         else:
