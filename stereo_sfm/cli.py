@@ -134,20 +134,12 @@ def _output_closed() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in reader.poll(0))
 
 
-def _fetch_inputs(options: argparse.Namespace) -> None:
-    """Replace what a command reads by copies, where it is in a bucket.
+def _fetched(value: object) -> object:
+    """An argument; what a command reads as a copy, where it is in a bucket.
 
     Raises:
         StereoSfmError: it cannot be fetched, or is not what a command reads: the folder `s3:` would be made of it.
     """
-    for name, value in vars(options).items():
-        if isinstance(value, list):
-            setattr(options, name, [_fetched(one) for one in value])
-        else:
-            setattr(options, name, _fetched(value))
-
-
-def _fetched(value: object) -> object:
     if not isinstance(value, Path):
         return value
     from stereo_sfm.storage.remote import InputPath, of_path
@@ -181,7 +173,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.command is None:
             parser.print_help()
             return 0
-        _fetch_inputs(options)
+        for name, value in vars(options).items():
+            setattr(options, name, [*map(_fetched, value)] if isinstance(value, list) else _fetched(value))
         command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
         code = command.run(options)
         if argv is None and options.command == "serve":

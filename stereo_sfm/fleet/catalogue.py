@@ -142,7 +142,7 @@ def opened(root: Remote, stores: Iterable[str]) -> Generator[Any]:
         for store in stores:
             for name, size, _ in objects.listed(root / store / "catalogue"):
                 table = name.partition("-")[0]
-                if name.endswith(".parquet") and table in found:
+                if name.endswith(".parquet") and table in found and "/" not in name:
                     path = Path(folder) / store / name
                     fetch_file(root / store / "catalogue" / name, path, size)
                     found[table].append(str(path))
@@ -153,7 +153,10 @@ def opened(root: Remote, stores: Iterable[str]) -> Generator[Any]:
                 names = ", ".join(f"{name} {kind}" for name, kind in columns.items())
                 connection.execute(f"CREATE TABLE {table} ({names})")
                 if found[table]:
-                    connection.execute(f"INSERT INTO {table} SELECT * FROM read_parquet(?)", [found[table]])
+                    # Tables of other versions may have fewer columns, or more.
+                    rows = connection.read_parquet(found[table], union_by_name=True)
+                    known = ", ".join(name for name in columns if name in rows.columns)
+                    connection.execute(f"INSERT INTO {table} BY NAME SELECT {known} FROM rows")
             yield connection
 
 

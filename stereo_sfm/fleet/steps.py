@@ -26,7 +26,7 @@ from stereo_sfm.input_file import read_json as read_file
 from stereo_sfm.jobs import Result
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import fetch_into, send_folder
+from stereo_sfm.storage.folders import SUMS, fetch_into, send_folder
 from stereo_sfm.storage.remote import Remote
 
 RESULT = "result.json"
@@ -209,9 +209,8 @@ def _put_once(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tup
                 raise
             except Exception as error:  # one walk stops no night
                 why = str(error).strip().partition("\n")[0] or type(error).__name__
-                outcomes[walk] = Outcome(
-                    why, identity, isinstance(error, Damaged) or not isinstance(error, StereoSfmError)
-                )
+                again = isinstance(error, Damaged) or not isinstance(error, StereoSfmError)
+                outcomes[walk] = Outcome(why, identity, again)
         if not sessions:
             return outcomes, out.version
         try:
@@ -235,6 +234,6 @@ def _put(out: Checkout, walk: Walk, result: Result, config: Config) -> list[str]
         except objects.Unreachable:
             raise
         except StereoSfmError as error:
-            objects.delete([made.parent / RESULT])
+            objects.delete([made.parent / RESULT, made / SUMS])
             raise Damaged(f"{error}: it is made again next time") from None
     return put_session(out.folder, session, walk.name, config, compress=False).changes

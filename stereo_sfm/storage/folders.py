@@ -106,6 +106,9 @@ def _files(remote: Remote) -> list[tuple[str, int, str]]:
         files = objects.listed(remote)
     if not files:
         raise objects.Missing(f"there is no {remote}")
+    outside = [name for name, _, _ in files if not name or {"", ".", ".."} & set(name.split("/"))]
+    if outside:
+        raise StereoSfmError(f"{remote} has {outside[0]!r}, which is no file in a folder: it is not fetched")
     return files
 
 

@@ -140,3 +140,17 @@ def write_bag(
     extra(bag)
     bag.close()
     return next(bag.path.glob("*.db3")) if kind == ".db3" else bag.path
+
+
+def compressed_bag(path: Path, mode: rosbag2.CompressionMode, plugin: rosbag2.StoragePlugin) -> Path:
+    """A copy of a folder's bag."""
+    writer = rosbag2.Writer(path.with_name("compressed"), version=9, storage_plugin=plugin)
+    writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    with rosbag2.Reader(path) as reader, writer:
+        of = {
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+            for c in reader.connections
+        }
+        for connection, time_ns, data in reader.messages():
+            writer.write(of[connection.id], time_ns, data)
+    return writer.path

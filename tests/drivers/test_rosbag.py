@@ -26,7 +26,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.system import Tracker
 from stereo_sfm.types import F64, StereoImage, WheelSamples
-from tests.drivers.ros_bags import FRAMES, KINDS, BagWriter, write_bag
+from tests.drivers.ros_bags import FRAMES, KINDS, BagWriter, compressed_bag, write_bag
 from tests.fuzz.formats import pack_messages
 
 SIMULATED = "sim:loop?size=212x200&frames=12&start=40&imu=t265"
@@ -242,25 +242,11 @@ def test_compressed_bags_are_read_up_to_a_limit(kind: str, tmp_path: Path, monke
     assert "is damaged: a compressed part has more than 10000 bytes" in _error_of(path)
 
 
-def _compressed(path: Path, mode: rosbag2.CompressionMode, plugin: rosbag2.StoragePlugin) -> Path:
-    """A copy of a folder's bag."""
-    writer = rosbag2.Writer(path.with_name("compressed"), version=9, storage_plugin=plugin)
-    writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
-    with rosbag2.Reader(path) as reader, writer:
-        of = {
-            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
-            for c in reader.connections
-        }
-        for connection, time_ns, data in reader.messages():
-            writer.write(of[connection.id], time_ns, data)
-    return writer.path
-
-
 def test_files_that_are_compressed_as_wholes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     source, images = _simulated()
     path = write_bag(tmp_path, KINDS[0], source.rig, images)
-    path = _compressed(path, rosbag2.CompressionMode.FILE, rosbag2.StoragePlugin.SQLITE3)
+    path = compressed_bag(path, rosbag2.CompressionMode.FILE, rosbag2.StoragePlugin.SQLITE3)
     before = set(tmp_path.iterdir())
     with open_source(path) as bag:
         for a, b in zip(bag, images, strict=True):
@@ -281,7 +267,7 @@ def test_files_that_are_compressed_as_wholes(tmp_path: Path, monkeypatch: pytest
 def test_a_bomb_in_an_mcap_file_of_a_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source, images = _simulated()
     path = write_bag(tmp_path, KINDS[2], source.rig, images)
-    path = _compressed(path, rosbag2.CompressionMode.STORAGE, rosbag2.StoragePlugin.MCAP)
+    path = compressed_bag(path, rosbag2.CompressionMode.STORAGE, rosbag2.StoragePlugin.MCAP)
     assert _error_of(path) == ""
     monkeypatch.setattr(unpacked, "MAX_BYTES", 10_000)
     assert "a compressed part has more than 10000 bytes" in _error_of(path)

@@ -122,6 +122,17 @@ def test_a_folder_comes_back_and_is_sent_once(place: str, tmp_path: Path) -> Non
     assert fetch(target) == here
 
 
+@pytest.mark.parametrize("name", ["../../out", "/out", "a//out", "a/../../out"])
+def test_nothing_is_written_outside_of_the_cache(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """S3 takes such names, and gives them back."""
+    monkeypatch.setenv("STEREO_SFM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(objects, "size_and_tag", lambda remote: (_ for _ in ()).throw(Missing("a folder")))
+    monkeypatch.setattr(objects, "listed", lambda remote: [("a", 1, "1"), (name, 1, "1")])
+    with pytest.raises(StereoSfmError, match="is no file in a folder"):
+        fetch(Remote.of("s3://bucket/folder"))
+    assert not list(tmp_path.rglob("out"))
+
+
 def test_a_truncated_upload_is_found(place: str, tmp_path: Path) -> None:
     (tmp_path / "f").mkdir()
     (tmp_path / "f" / "a").write_bytes(b"1" * 1000)

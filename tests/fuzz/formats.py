@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import zstandard
+from rosbags import rosbag2
 
 from stereo_sfm.calib.mask import encode_mask, mask_to_text
 from stereo_sfm.cli import main
@@ -24,7 +25,7 @@ from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.recording.segments import Segment, new_recording
 from stereo_sfm.types import Trajectory
 from tests.drivers.dataset_folders import RIG, make_images
-from tests.drivers.ros_bags import KINDS, write_bag
+from tests.drivers.ros_bags import KINDS, compressed_bag, write_bag
 from tests.fuzz.bombs import zstd_zeros
 from tests.fuzz.mutate import damaged, damaged_json, damaged_text
 from tests.maps.maps import small_map
@@ -94,7 +95,7 @@ def _damage_rows(path: Path, rng: random.Random) -> None:
 
 
 def make_bags(folder: Path) -> list[Path]:
-    """A bag of each kind, and one whose messages are compressed one by one."""
+    """A bag of each kind, and those whose messages, chunks and files are compressed."""
     paths: list[Path] = []
     with open_source("sim:loop?size=80x64&frames=4&start=40&imu=t265") as source:
         images = list(source)
@@ -103,7 +104,10 @@ def make_bags(folder: Path) -> list[Path]:
             paths.append(write_bag(folder / str(number), kind, source.rig, images))
     packed = shutil.copytree(paths[0], folder / "packed")
     pack_messages(packed, lambda data: zstandard.compress(data))
-    return [*paths, packed]
+    modes = rosbag2.CompressionMode
+    chunks = compressed_bag(paths[2], modes.STORAGE, rosbag2.StoragePlugin.MCAP)
+    files = compressed_bag(paths[0], modes.FILE, rosbag2.StoragePlugin.SQLITE3)
+    return [*paths, packed, chunks, files]
 
 
 def pack_messages(bag: Path, pack: Callable[[bytes], bytes]) -> None:
