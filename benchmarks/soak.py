@@ -231,7 +231,7 @@ def cause(service: Service, watch: Watch, fault: str) -> float:
     if pid is None:
         return 0.0
     os.kill(pid, signal.SIGKILL if kind == "kill" else signal.SIGSTOP)
-    if what == "recorder":
+    if what in ("recorder", "loop"):  # which cost no session
         wait_for(lambda: service.pids.get(what) not in (None, pid))
     else:
         wait_for(lambda: len(watch.sessions) > session and watch.tracked)

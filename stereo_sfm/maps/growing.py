@@ -83,6 +83,9 @@ class GrowingMap:
             loop = dataclasses.replace(place, kf_id=place.kf_id + self._first_kf, matches=matches)
             self._joining.close(loop)
         self._enqueue(s, ids, new, pt_ids)
+        self._map.take_delta()  # nobody follows its changes
+        if self._map.much_removed:
+            self._map.compact(pt_ids)
 
     def work(self) -> bool:
         """Look for loops of the next keyframe. Returns whether there was something to do."""
@@ -186,7 +189,8 @@ class GrowingMap:
     # -- loops -------------------------------------------------------------------------------------------------------
 
     def _enqueue(self, s: MapSnapshot, ids: I64, new: Bool, pt_ids: I64) -> None:
-        """New keyframes for the search, with the ids of this map."""
+        """New keyframes for the search, with the ids of this map, after those that the session has not culled."""
+        self._queue = deque(keyframe for keyframe in self._queue if keyframe.kf_id in self._odometry)
         renamed = dataclasses.replace(s, kf_ids=ids, pt_ids=pt_ids)
         for k, keyframe in enumerate(renamed.keyframes()):
             if new[k]:

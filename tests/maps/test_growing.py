@@ -15,7 +15,7 @@ from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.growing import GrowingMap
 from stereo_sfm.maps.merge import subset
 from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.maps.update import update
+from stereo_sfm.maps.update import Update, update
 from stereo_sfm.types import LoopResult
 from tests.loop.store_sequence import StoreSequence, make_sequence
 from tests.maps.maps import map_of_sequence
@@ -41,15 +41,19 @@ def two_drives() -> tuple[StoreSequence, StoreSequence, voc.Vocabulary]:
     return parts[0], parts[1], voc.train([k.descriptors for k in parts[0].keyframes], depth=3)
 
 
-def test_a_session_is_joined_as_it_goes_on() -> None:
+def second_drive() -> tuple[StoreSequence, StoreSequence, SavedMap, SavedMap, voc.Vocabulary, Update, LoopResult]:
+    """Two drives, their maps, the vocabulary, both maps joined at the end, and a loop from the first to the second."""
     before, after, vocabulary = two_drives()
     saved, walk = map_of_sequence(before), map_of_sequence(after)
     done = update(saved, walk, vocabulary, LoopConfig(), MapperConfig())
     begins, points = (int(ids.max()) + 1 for ids in (saved.snapshot.kf_ids, saved.snapshot.pt_ids))
     loop = next(one for one in done.loops if one.candidate_kf_id < begins <= one.kf_id)
-    place: LoopResult = dataclasses.replace(
-        loop, kf_id=loop.kf_id - begins, matches=loop.matches - np.array([0, points])
-    )
+    place = dataclasses.replace(loop, kf_id=loop.kf_id - begins, matches=loop.matches - np.array([0, points]))
+    return before, after, saved, walk, vocabulary, done, place
+
+
+def test_a_session_is_joined_as_it_goes_on() -> None:
+    before, after, saved, walk, vocabulary, done, place = second_drive()
     growing = GrowingMap(saved, vocabulary, Config())
     with pytest.raises(StereoSfmError, match="not found in the saved map yet"):
         growing.take(walk, None)
@@ -74,3 +78,26 @@ def test_a_session_is_joined_as_it_goes_on() -> None:
     gone = first(walk, len(walk) - 3)  # the session culled its last keyframes
     growing.take(gone, place)
     assert len(growing.saved()) == len(saved) + len(gone)
+
+
+def test_what_the_session_culled_takes_no_memory() -> None:
+    _, _, saved, walk, vocabulary, _, place = second_drive()
+    growing, begin = (
+        GrowingMap(saved, vocabulary, Config()),
+        int(np.searchsorted(walk.snapshot.kf_ids, place.kf_id)) + 1,
+    )
+    growing.take(walk, place)
+    map_ = growing._map  # pyright: ignore[reportPrivateUsage]
+    rows = len(map_.observations), len(map_.points)
+    growing.take(first(walk, begin), place)
+    assert not map_.much_removed and len(map_.observations) < 0.8 * rows[0] and len(map_.points) < 0.8 * rows[1]
+    assert not any(map(len, map_.take_delta()))
+    queued = [keyframe.kf_id for keyframe in growing._queue]  # pyright: ignore[reportPrivateUsage]
+    assert len(queued) == begin
+    while growing.work():
+        pass
+    s, once = growing.saved().snapshot, GrowingMap(saved, vocabulary, Config())
+    once.take(first(walk, begin), place)
+    while once.work():
+        pass
+    assert len(s.kf_ids) == len(saved) + begin and len(s.pt_ids) == len(once.saved().snapshot.pt_ids)

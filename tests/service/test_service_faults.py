@@ -83,6 +83,18 @@ def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: 
             assert sum(1 for _ in source) > 5
 
 
+def test_sessions_that_died_leave_no_file_open(tmp_path: Path) -> None:
+    with running(config(tmp_path)) as watched:
+        sessions, opened = list[Started](), list[int]()
+        watched.service.on(Started, sessions.append)
+        for count in range(1, 5):
+            wait_for(lambda: len(sessions) >= count)  # noqa: B023
+            watched.more_poses(250)  # a standby is started, after the session before is forgotten
+            opened.append(len(os.listdir("/proc/self/fd")))
+            os.kill(watched.service.pids["tracker"], signal.SIGKILL)
+    assert opened[3] <= opened[1] + 2, opened
+
+
 def test_a_killed_loop_closer_costs_no_session(tmp_path: Path) -> None:
     with running(config(tmp_path)) as watched:
         pid = watched.service.pids["loop"]
