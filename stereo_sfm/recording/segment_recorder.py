@@ -89,7 +89,7 @@ class SegmentRecorder:
         self._number, self._began_ns = 0, -1
         self.segment: Segment | None = None
         self._segment_ns = self._newest_ns = 0
-        self._history: deque[tuple[Segment, int]] = deque(maxlen=10_000)  # with the stamp of its beginning
+        self._history: deque[tuple[Segment, int]] = deque()  # what a mark may reach; with the stamp of its beginning
         self._marked_until_ns, self._mark_text = -1, ""
         self._next_thumbnail_ns = 0
         self._missed: list[StereoImage] = []  # images dropped since the last one kept, without their pixels
@@ -186,6 +186,8 @@ class SegmentRecorder:
         self._number, self._segment_ns = self._number + 1, stamp_ns
         self._due.set()  # the quota is never exceeded by more than a segment, however fast they follow each other
         self._history.append((self.segment, stamp_ns))
+        while len(self._history) > 1 and self._history[1][1] <= stamp_ns - int(self._policy.mark_before_s * 1e9):
+            self._history.popleft()
         for writer in (self._images, self._poses):
             writer.turn(self.segment)
         if stamp_ns <= self._marked_until_ns:

@@ -200,7 +200,7 @@ def _seconds(folder: Path, last: Segment) -> int:
         return last.second
 
 
-@functools.lru_cache(maxsize=10_000)
+@functools.lru_cache(maxsize=1000)
 def _poses_s(path: Path, size: int, written_ns: int) -> float | None:
     """Seconds from the first to the last pose of a closed file; None for one that is being written, or cut off.
 
