@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import psutil
 import pytest
@@ -77,6 +78,7 @@ def test_poses_may_come_before_the_map(first: bool, monkeypatch: pytest.MonkeyPa
     """A robot may be moving while its pipeline starts again."""
     run, asked = ProcessRun(MadeSource.of(SlidingWall, 1), Config(), pose_first=first), list[tuple[str, object]]()
     monkeypatch.setattr(type(run._stages), "request", lambda _, *given: asked.append(given))  # pyright: ignore[reportPrivateUsage]
+    monkeypatch.setattr(ProcessRun, "_loop", SimpleNamespace(ready=lambda: None))
     run._live, run._not_ready = True, {"tracker", "mapper", "loop", "optimizer"}  # pyright: ignore[reportPrivateUsage]
     run._begin("tracker")  # pyright: ignore[reportPrivateUsage]
     assert (("capture", "go") in asked) == first
