@@ -26,11 +26,14 @@ _ANOTHER_PATH = re.compile(r"[?#]|%[0-9a-fA-F]{2}")  # of a path in the address 
 _QUALITIES = "offered_qos_profiles"
 
 
-def check_bag(path: Path) -> None:
+def check_bag(path: Path) -> dict[str, Any]:
     """Look at all files of a bag.
 
     Args:
         path: a bag's folder, or one of its files.
+
+    Returns:
+        The content of its metadata.yaml; empty where it has none.
 
     Raises:
         NotAFile: a pipe or a device among them, or a metadata.yaml larger than `MOST_METADATA`.
@@ -38,42 +41,29 @@ def check_bag(path: Path) -> None:
         OSError: no such file.
     """
     files = sorted(p for p in path.iterdir() if p.exists() and not p.is_dir()) if path.is_dir() else [path]
-    values = 0
+    metadata, values = dict[str, Any](), 0
     for file in files:
         open_regular(file).close()
         if file.suffix == ".db3" and (found := _ANOTHER_PATH.search(str(file))):
             raise ValueError(f"the library takes {file} for another path: rename what has '{found[0]}' in its name")
-        for text in _texts(file):
-            values = count_values(text, values + 1)
+        if file.name == METADATA:
+            metadata = read_yaml(file, MOST_METADATA)
+            texts = _of_topics(metadata)
+        else:
+            texts = _of_table(file) if file.suffix == ".db3" else _of_channels(file) if file.suffix == ".mcap" else []
+        for text in texts:
+            if isinstance(text, str):
+                values = count_values(text, values + 1)
+    return metadata
 
 
-def read_metadata(folder: Path) -> dict[str, Any]:
-    """What the metadata.yaml of a bag says.
-
-    Raises:
-        NotAFile: it is no regular file, or larger than `MOST_METADATA`. OSError: it cannot be read.
-        ValueError: it is no YAML, or no mapping.
-    """
-    data = read_yaml(folder / METADATA, MOST_METADATA)
-    if not isinstance(data, dict):
-        raise ValueError(f"its {METADATA} does not list its topics")
-    return data
-
-
-def _texts(file: Path) -> Iterator[Any]:
-    """The texts in a file that are parsed as YAML."""
-    if file.name == METADATA:
-        data = read_metadata(file.parent)
-        try:
-            topics = data[INFORMATION]["topics_with_message_count"]
-            found = [topic["topic_metadata"].get(_QUALITIES) for topic in topics]
-        except (LookupError, TypeError, AttributeError):
-            raise ValueError(f"its {METADATA} does not list its topics") from None
-    elif file.suffix == ".mcap":
-        found = _of_channels(file)
-    else:
-        found = _of_table(file) if file.suffix == ".db3" else []
-    yield from (text for text in found if isinstance(text, str))
+def _of_topics(metadata: Any) -> list[Any]:
+    """The texts of the topics that a metadata.yaml lists."""
+    try:
+        topics = metadata[INFORMATION]["topics_with_message_count"]
+        return [topic["topic_metadata"].get(_QUALITIES) for topic in topics]
+    except (LookupError, TypeError, AttributeError):
+        raise ValueError(f"its {METADATA} does not list its topics") from None
 
 
 def _of_channels(file: Path) -> list[Any]:

@@ -94,8 +94,7 @@ class BagReader:
         from rosbags import rosbag1, rosbag2
 
         try:
-            check_bag(self.path)
-            path = unpacked_files(self.path, opened)
+            path = unpacked_files(self.path, check_bag(self.path), opened)
             limit_chunks_of_mcap()
             reader = rosbag1.Reader(path) if self._ros_1 else rosbag2.Reader(path)
             reader.open()

@@ -6,14 +6,10 @@ import argparse
 import fnmatch
 import glob
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from stereo_sfm.commands._cluster import on_cluster
 from stereo_sfm.errors import StereoSfmError
-
-if TYPE_CHECKING:
-    from stereo_sfm.eval.batch import BatchTask
 
 SOME_FAILED = 3
 
@@ -46,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
         batch.BatchTask(spec, str(folder), config, merging) for spec, folder in zip(recordings, folders, strict=True)
     ]
     results = {}
-    for task, result in _results(tasks, args.address):
+    for task, result in on_cluster(batch.run_batch(tasks, args.address), args.address):
         results[task.folder] = result
         state = "ok" if result["ok"] else "failed"
         again = ", from before" if result.get("resumed") else ""
@@ -60,19 +56,6 @@ def run(args: argparse.Namespace) -> int:
     if merging and len(maps) > 1:
         print(batch.merge_maps(maps, config, args.output / "map"))
     return SOME_FAILED if any(not r["ok"] for r in results.values()) else 0
-
-
-def _results(tasks: Sequence[BatchTask], address: str | None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
-    from stereo_sfm.eval.batch import run_batch
-
-    try:
-        yield from run_batch(tasks, address)
-    except (ConnectionError, ValueError, RuntimeError) as error:  # the last: this computer is no node of it
-        if address is None:
-            raise
-        raise StereoSfmError(
-            f"no Ray cluster at {address} (leave out --address to use this machine): {str(error).splitlines()[0]}"
-        ) from None
 
 
 def _expand(patterns: list[str]) -> list[str]:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import argparse
 import datetime
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._cluster import on_cluster
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from stereo_sfm.fleet.plan import Plan, Walk
-    from stereo_sfm.jobs import Job, Result
+    from stereo_sfm.fleet.plan import Plan
 
 SOME_FAILED = 3
 
@@ -53,13 +52,13 @@ def run(args: argparse.Namespace) -> int:
 def _run(plan: Plan, address: str | None) -> int:
     """A walk or a night that failed does not stop the others; the exit code says that there is one."""
     from stereo_sfm.fleet.plan import find_walks
-    from stereo_sfm.fleet.run import forget_images
+    from stereo_sfm.fleet.run import forget_images, run_plan
 
     walks, waiting = find_walks(plan)
     for place in waiting:
         print(f"not complete yet: {place}", file=sys.stderr)
     failed = again = count = 0
-    for count, (job, result) in enumerate(_results(plan, address, walks), 1):
+    for count, (job, result) in enumerate(on_cluster(run_plan(plan, address, walks), address) if walks else (), 1):
         why = [] if result["ok"] else [result["error"].strip().splitlines()[-1]]
         why += [f"{name}: {text}" for name, text in result.get("failed", {}).items()] if result["ok"] else []
         again += bool(result.get("resumed"))
@@ -75,19 +74,6 @@ def _run(plan: Plan, address: str | None) -> int:
         + (f", {deleted / 1e9:.2f} GB of recordings deleted" if deleted else "")
     )
     return SOME_FAILED if failed else 0
-
-
-def _results(plan: Plan, address: str | None, walks: list[Walk]) -> Iterator[tuple[Job, Result]]:
-    from stereo_sfm.fleet.run import run_plan
-
-    if not walks:
-        return
-    try:
-        yield from run_plan(plan, address, walks)
-    except (ConnectionError, ValueError, RuntimeError) as error:  # the last: this computer is no node of it
-        if address is None:
-            raise
-        raise StereoSfmError(f"no Ray cluster at {address}: {str(error).splitlines()[0]}") from None
 
 
 def _report(plan: Plan, folder: Path, query: str | None) -> int:

@@ -152,7 +152,7 @@ def update_store(root: Remote, walks: list[Walk], config: Config, results: Mappi
     lasting = all(result.get("lasting") and not outcomes[walk].again for walk, result in mine.items())
     failed = {walk.name: outcome.why for walk, outcome in outcomes.items() if outcome.why}
     # Walks whose recordings were deleted since keep their rows.
-    rows = before | {walk.name: walk_row(walk, mine[walk], *outcomes[walk][:2]) for walk in walks}
+    rows = before | {walk.name: walk_row(walk, mine[walk], o.why, o.session) for walk, o in outcomes.items()}
     versions = history(place) if version is not None else []
     tables = night_tables(store, night, [rows[k] for k in sorted(rows)], versions, time.perf_counter() - begin)
     write_tables(root / store / "catalogue", night, tables)

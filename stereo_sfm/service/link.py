@@ -125,8 +125,6 @@ class OutputProcess:
 
     def _run_once(self) -> None:
         """Start the process and listen to it until it ends."""
-        if self.name == "ros2":
-            dds_memory.sweep()  # a service before this one may have been killed
         (messages, to_output), (reports, to_main), (replies, to_client) = (pipe() for _ in range(3))
         process = start_child(f"output {self.name}", run_output, self._module, self._config, messages, to_main, replies)
         self.starts += 1

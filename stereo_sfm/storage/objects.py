@@ -152,9 +152,7 @@ def read(remote: Remote) -> bytes:
 def read_tagged(remote: Remote) -> tuple[bytes, str]:
     """The content of an object and the tag of this content."""
     with _opened(remote, "read") as store:
-        import obstore
-
-        found = obstore.get(store, remote.key)
+        found = store.get(remote.key)
         return bytes(found.bytes()), str(found.meta[_condition(remote)])
 
 
@@ -170,18 +168,14 @@ def size_and_tag(remote: Remote) -> tuple[int, str]:
         Missing: there is none.
     """
     with _opened(remote, "read") as store:
-        import obstore
-
-        meta = obstore.head(store, remote.key)
+        meta = store.head(remote.key)
         return int(meta["size"]), str(meta["e_tag"])
 
 
 def written(remote: Remote) -> date:
     """The day on which an object was written, in UTC."""
     with _opened(remote, "read") as store:
-        import obstore
-
-        return obstore.head(store, remote.key)["last_modified"].date()
+        return store.head(remote.key)["last_modified"].date()
 
 
 def exists(remote: Remote) -> bool:
@@ -196,9 +190,7 @@ def exists(remote: Remote) -> bool:
 def read_range(remote: Remote, start: int, length: int) -> bytes:
     """A part of an object."""
     with _opened(remote, "read") as store:
-        import obstore
-
-        return bytes(obstore.get_range(store, remote.key, start=start, length=length))
+        return bytes(store.get_range(remote.key, start=start, length=length))
 
 
 def read_ranges(remote: Remote, ranges: Iterable[tuple[int, int]]) -> list[bytes]:
@@ -206,20 +198,16 @@ def read_ranges(remote: Remote, ranges: Iterable[tuple[int, int]]) -> list[bytes
     wanted = [(start, length) for start, length in ranges if length > 0]
     if not wanted:
         return []
-    import obstore
-
     starts, lengths = [start for start, _ in wanted], [length for _, length in wanted]
     with _opened(remote, "read") as store:
-        found = obstore.get_ranges(store, remote.key, starts=starts, lengths=lengths, coalesce=0)
+        found = store.get_ranges(remote.key, starts=starts, lengths=lengths, coalesce=0)
         return [bytes(part) for part in found]
 
 
 def write(remote: Remote, data: bytes | Path | Iterable[bytes]) -> None:
     """Write an object whole: nobody sees a part of it."""
     with _opened(remote, "write") as store:
-        import obstore
-
-        obstore.put(store, remote.key, data, max_concurrency=PARTS_AT_ONCE)
+        store.put(remote.key, data, max_concurrency=PARTS_AT_ONCE)
 
 
 def create(remote: Remote, data: bytes) -> None:
@@ -249,10 +237,8 @@ def _conditional(remote: Remote, data: bytes, tag: str | None) -> None:
             _exchange_file(remote, data, tag)
             return
         with _opened(remote, "write") as store:
-            import obstore
-
             mode: Any = "create" if tag is None else {_condition(remote): tag}
-            obstore.put(store, remote.key, data, mode=mode, use_multipart=False)
+            store.put(remote.key, data, mode=mode, use_multipart=False)
     except (Changed, Unreachable):
         with contextlib.suppress(Missing):
             if read(remote) == data:
@@ -285,22 +271,18 @@ def listed(remote: Remote) -> list[tuple[str, int, str]]:
     Raises:
         StereoSfmError: there is no such bucket, or no right to list it.
     """
-    import obstore
-
     prefix = f"{remote.key}/" if remote.key else ""
     with _opened(remote, "list") as store:
-        found = [m for page in obstore.list(store, prefix=prefix or None) for m in page]
+        found = [m for page in store.list(prefix=prefix or None) for m in page]
     rows = [(str(m["path"]).removeprefix(prefix), int(m["size"]), str(m["e_tag"])) for m in found]
     return sorted(row for row in rows if row[0])
 
 
 def folders(remote: Remote) -> list[str]:
     """The names of the folders in a folder."""
-    import obstore
-
     prefix = f"{remote.key}/" if remote.key else ""
     with _opened(remote, "list") as store:
-        found = obstore.list_with_delimiter(store, prefix=prefix or None)["common_prefixes"]
+        found = store.list_with_delimiter(prefix=prefix or None)["common_prefixes"]
     return sorted(str(name).rstrip("/").rpartition("/")[2] for name in found)
 
 
@@ -308,6 +290,4 @@ def delete(remotes: Iterable[Remote]) -> None:
     """Remove objects; those that are gone already are as good."""
     for remote in remotes:
         with contextlib.suppress(Missing), _opened(remote, "delete") as store:
-            import obstore
-
-            obstore.delete(store, remote.key)
+            store.delete(remote.key)

@@ -146,9 +146,14 @@ def compressed_bag(path: Path, mode: rosbag2.CompressionMode, plugin: rosbag2.St
     """A copy of a folder's bag."""
     writer = rosbag2.Writer(path.with_name("compressed"), version=9, storage_plugin=plugin)
     writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
-    with rosbag2.Reader(path) as reader, writer:
+    return copied(rosbag2.Reader(path), writer, "rihs01")
+
+
+def copied(reader: Any, writer: Any, digest: str) -> Path:
+    """Write a bag's messages into another one. `digest`: what the writer calls the checksum of a type."""
+    with reader, writer:
         of = {
-            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, rihs01=c.digest)
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, **{digest: c.digest})
             for c in reader.connections
         }
         for connection, time_ns, data in reader.messages():

@@ -26,7 +26,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.system import Tracker
 from stereo_sfm.types import F64, StereoImage, WheelSamples
-from tests.drivers.ros_bags import FRAMES, KINDS, BagWriter, compressed_bag, write_bag
+from tests.drivers.ros_bags import FRAMES, KINDS, BagWriter, compressed_bag, copied, write_bag
 from tests.fuzz.formats import pack_messages
 
 SIMULATED = "sim:loop?size=212x200&frames=12&start=40&imu=t265"
@@ -221,14 +221,7 @@ def _rewritten(path: Path, kind: str) -> Path:
         return path
     writer = rosbag1.Writer(path.with_name(f"{kind}.bag"))
     writer.set_compression(rosbag1.Writer.CompressionFormat[kind])
-    with rosbag1.Reader(path) as reader, writer:
-        of = {
-            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
-            for c in reader.connections
-        }
-        for connection, time_ns, data in reader.messages():
-            writer.write(of[connection.id], time_ns, data)
-    return writer.path
+    return copied(rosbag1.Reader(path), writer, "md5sum")
 
 
 @pytest.mark.parametrize("kind", ["BZ2", "LZ4", "message"])

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.messages import HealthReport, MapCloud, PoseUpdate, ServiceMessage, Started, Status
+from stereo_sfm.service.outputs import dds_memory
 from stereo_sfm.service.outputs.floor_grid import FloorGrids, aligned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.settings import Ros2Config
@@ -80,6 +81,7 @@ class Ros2Output:
         from rclpy.executors import MultiThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
+        dds_memory.sweep()  # a service before this one may have been killed
         try:
             if not rclpy.ok():
                 rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
