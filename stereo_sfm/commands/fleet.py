@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(plan: Plan, address: str | None) -> int:
     """A walk or a night that failed does not stop the others; the exit code says that there is one."""
     from stereo_sfm.fleet.plan import find_walks
-    from stereo_sfm.fleet.run import forget_images, run_plan
+    from stereo_sfm.fleet.run import forget_images, forget_versions, run_plan
 
     walks, waiting = find_walks(plan)
     for place in waiting:
@@ -67,11 +67,14 @@ def _run(plan: Plan, address: str | None) -> int:
             version = f", version {result['version']}" if result.get("version") else ""
             print(f"{count} {job.name}: {'; '.join(why) or 'ok'}{version}", file=sys.stderr)
     deleted = forget_images(plan, walks, datetime.date.today(), waiting)
+    stores = sorted({walk.store for walk in walks})
+    forgotten = forget_versions(plan, stores)
     nights = len({(walk.store, walk.night) for walk in walks})
     print(
-        f"{len(walks)} walks in {nights} nights of {len({walk.store for walk in walks})} stores:"
+        f"{len(walks)} walks in {nights} nights of {len(stores)} stores:"
         f" {count - again} of {count} jobs done now, {failed} failed"
         + (f", {deleted / 1e9:.2f} GB of recordings deleted" if deleted else "")
+        + (f", {forgotten / 1e9:.2f} GB of old versions deleted" if forgotten else "")
     )
     return SOME_FAILED if failed else 0
 

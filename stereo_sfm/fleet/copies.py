@@ -14,7 +14,7 @@ from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet.patches import expanded
-from stereo_sfm.fleet.versions import HEAD, StoredFile, Version, patch_name, read_file, read_version, released
+from stereo_sfm.fleet.versions import HEAD, StoredFile, Version, read_file, read_version, released
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.input_file import read_bytes, read_json
 from stereo_sfm.maps.replace_folder import recover, replaced_folder
@@ -80,7 +80,7 @@ def _file(store: Remote, version: Version, name: str, old: bytes | None) -> tupl
     if old is not None:
         digest = hashlib.sha256(old).hexdigest()
         steps = _steps(store, version, name, digest, file.stored)
-        data = _patched(store, old, digest, steps) if steps is not None else None
+        data = _patched(store, old, steps) if steps is not None else None
         if data is not None:
             return data, sum(step.patched for step in steps or ())
     return read_file(store, file), file.stored
@@ -110,17 +110,17 @@ def _steps(store: Remote, version: Version, name: str, have: str, most: int) -> 
     return None
 
 
-def _patched(store: Remote, data: bytes, have: str, steps: list[StoredFile]) -> bytes | None:
+def _patched(store: Remote, data: bytes, steps: list[StoredFile]) -> bytes | None:
     """A file after these differences; None where one of them is missing or damaged: the whole file is fetched then."""
     for step in steps:
         try:
-            raw = objects.read(store / patch_name(have, step.sha256))
+            raw = objects.read(store / step.differences)
         except objects.Missing:
             return None
         made = expanded(raw, step.bytes, data)
         if made is None or hashlib.sha256(made).hexdigest() != step.sha256:
             return None
-        data, have = made, step.sha256
+        data = made
     return data
 
 
@@ -132,7 +132,7 @@ def fetched_map(remote: Remote, robot: str = "") -> Path:
     Raises:
         StereoSfmError: there is no map, or it is damaged.
     """
-    place = cache_root() / "stores" / hashlib.sha256(str(remote).encode()).hexdigest()[:16] / remote.name
+    place = _cached(remote)
     place.parent.mkdir(parents=True, exist_ok=True)
     with FolderLock(place.parent, "another program fetches this map: try again"):
         if not version_of(place)[1] and objects.exists(remote / "map.json"):
@@ -141,9 +141,15 @@ def fetched_map(remote: Remote, robot: str = "") -> Path:
     return place
 
 
+def _cached(store: Remote) -> Path:
+    """Where a store's map is in the cache."""
+    return cache_root() / "stores" / hashlib.sha256(str(store).encode()).hexdigest()[:16] / store.name
+
+
 def fetched(remote: Remote) -> Path:
     """A copy of a file, a folder or a store's map in the cache."""
-    return fetched_map(remote) if objects.exists(remote / HEAD) else fetch(remote)
+    a_store = version_of(_cached(remote))[1] or objects.exists(remote / HEAD)
+    return fetched_map(remote) if a_store else fetch(remote)
 
 
 def fetch_released(remote: Remote, robot: str, folder: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import stereo_sfm
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet.copies import STATE, fetch_version
 from stereo_sfm.fleet.versions import Head, Version, publish, read_head, read_version
+from stereo_sfm.fleet.work_folder import work_folder
 from stereo_sfm.maps.columns import COLUMNS
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.storage.remote import Remote
@@ -60,9 +60,9 @@ def checked_out(store: Remote, begin: bool = False) -> Generator[Checkout]:
     Raises:
         StereoSfmError: there is no version and `begin` is False.
     """
-    with tempfile.TemporaryDirectory(prefix="store") as place:
+    with work_folder() as place:
         head = read_head(store)
-        folder = Path(place) / store.name
+        folder = place / store.name
         if not head.version:
             if not begin:
                 raise StereoSfmError(f"no map at {store}: 'stereo-sfm map update {store} SESSION' begins one")

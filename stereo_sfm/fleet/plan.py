@@ -47,6 +47,9 @@ class FleetConfig:
     keep_images_days: int = number(
         0, 0, 36500, "Days after which recordings are deleted, for people are in them; 0: never"
     )
+    keep_versions: int = number(
+        0, 0, 36500, "Versions of a store whose files are kept, besides those that robots were given; 0: all"
+    )
 
 
 @dataclass(frozen=True)

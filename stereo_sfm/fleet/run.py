@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import datetime
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby, pairwise
 from typing import Any
 
+from stereo_sfm.fleet import versions
 from stereo_sfm.fleet.plan import UNDATED, Plan, Walk, night_of
 from stereo_sfm.fleet.steps import job_name, map_walk, read_json, update_store
 from stereo_sfm.jobs import Job, Limits, Result, run_jobs
@@ -71,6 +73,15 @@ def forget_images(plan: Plan, walks: list[Walk], today: datetime.date, waiting: 
         beside = place.parent / f"{place.name}{SUM}"
         objects.delete([place / name for name in names] if names else [place, beside])
         deleted += walk.bytes
+    return deleted
+
+
+def forget_versions(plan: Plan, stores: Iterable[str]) -> int:
+    """Delete the files of versions that the plan does not keep; bytes of them."""
+    deleted = 0
+    for store in stores if plan.fleet.keep_versions else ():
+        with contextlib.suppress(objects.Changed):  # somebody writes this store: next night
+            deleted += versions.forget_versions(plan.root / store / "map", plan.fleet.keep_versions)
     return deleted
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +21,7 @@ from stereo_sfm.fleet.catalogue import night_tables, walk_row, write_tables
 from stereo_sfm.fleet.editing import Checkout, checked_out, session_id
 from stereo_sfm.fleet.plan import Walk
 from stereo_sfm.fleet.versions import Version, history
+from stereo_sfm.fleet.work_folder import work_folder
 from stereo_sfm.input_file import read_json as read_file
 from stereo_sfm.jobs import Result
 from stereo_sfm.log.reader import LogReader
@@ -56,8 +56,8 @@ def map_walk(root: Remote, walk: Walk, config: Config) -> Result:
     if done is not None:
         return {**done, "resumed": True}
     begin = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="walk") as folder:
-        result = _mapped(walk, config, Path(folder))
+    with work_folder() as folder:
+        result = _mapped(walk, config, folder)
         if result["ok"]:
             result["session_bytes"] = send_folder(Path(result.pop("map")), place / "map")
             result["session"] = str(place / "map")
@@ -225,10 +225,10 @@ def _put(out: Checkout, walk: Walk, result: Result, config: Config) -> list[str]
     from stereo_sfm.maps.saved_map import load_map
 
     made = Remote.of(result["session"])
-    with tempfile.TemporaryDirectory(prefix="session") as folder:
+    with work_folder() as folder:
         try:
-            fetch_into(made, Path(folder) / "map")
-            session = load_map(Path(folder) / "map")
+            fetch_into(made, folder / "map")
+            session = load_map(folder / "map")
             if session_id(session) != result["id"]:
                 raise StereoSfmError(f"{made} is not what was made")
         except objects.Unreachable:

@@ -3,15 +3,17 @@
     STORE/head.json                   the version that counts: exchanged on the condition that nobody else did
     STORE/release.json                the version of each robot; without it all have the head's
     STORE/versions/00012-5f0c...json  a version: its files, its sessions, its parent; never changed
-    STORE/files/SHA256.zst            a file as a whole
-    STORE/patches/FROM-TO.zst         a file as its differences from the parent's
+    STORE/files/00012-5f0c.../SHA256.zst    a file as a whole, of the version that wrote it
+    STORE/patches/00012-5f0c.../SHA256.zst  the same file as its differences from the parent's
 
 Two programs that write at the same time both write objects of their own; the exchange of the head decides, and the
-other program learns of it. A version that lost is never read by anybody.
+other program learns of it. A version that lost is never read by anybody. A new version names objects of its own and
+of its parent only, so those that no kept version names can be deleted beside a program that writes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -31,6 +33,7 @@ from stereo_sfm.storage.remote import Remote
 HEAD, RELEASE = "head.json", "release.json"
 KIND = "stereo_sfm_store"
 _MANIFEST = re.compile(r"versions/(\d{5,})-[0-9a-f]+\.json")
+_CONTENT = re.compile(r"(?:files|patches)/(?:(\d{5,})-[0-9a-f]+/)?[0-9a-f-]+\.zst")
 T = TypeVar("T")
 
 
@@ -43,6 +46,17 @@ class StoredFile:
     stored: int  # bytes of the object that holds it as a whole
     patched: int = 0  # bytes of its differences from the parent's file; 0: there are none
     base: str = ""  # SHA-256 of the parent's file
+    at: str = ""  # folder of the version that wrote it, "" of stores of before, which had one folder for all
+
+    @property
+    def whole(self) -> str:
+        """Name of the object that holds it as a whole."""
+        return f"files/{self.at}/{self.sha256}.zst" if self.at else f"files/{self.sha256}.zst"
+
+    @property
+    def differences(self) -> str:
+        """Name of the object that holds its differences from the parent's."""
+        return f"patches/{self.at}/{self.sha256}.zst" if self.at else f"patches/{self.base}-{self.sha256}.zst"
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,7 @@ class Head:
     next: int = 1  # number of the version that is made next: numbers are never used again
     refused: tuple[str, ...] = ()  # sessions of versions that were rolled back: they are not put in again
     by: str = ""
+    oldest: int = 0  # number of the first version whose files are kept, besides those that robots were given
     tag: str | None = None  # of the object; None: there is none
 
     def text(self) -> bytes:
@@ -96,7 +111,11 @@ def read_head(store: Remote) -> Head:
         raw, tag = objects.read_tagged(store / HEAD)
     except objects.Missing:
         return Head()
-    return _parsed(store / HEAD, raw, lambda d: Head(d["version"], d["next"], tuple(d["refused"]), d["by"], tag))
+
+    def make(data: dict[str, Any]) -> Head:
+        return Head(data["version"], data["next"], tuple(data["refused"]), data["by"], data.get("oldest", 0), tag)
+
+    return _parsed(store / HEAD, raw, make)
 
 
 def read_version(store: Remote, name: str) -> Version:
@@ -166,14 +185,15 @@ def publish(
         Changed: another program has written a version since `head` was read; this one is not in the store.
     """
     before = read_version(store, head.version) if head.version else None
+    by = secrets.token_hex(8)
+    at = f"{head.next:05d}-{by}"
     files: dict[str, StoredFile] = {}
     for path in sorted(p for p in folder.iterdir() if p.is_file() and not p.name.startswith(".")):
         old = before.files.get(path.name) if before else None
-        files[path.name] = _stored(store, read_bytes(path), old)
-    by = secrets.token_hex(8)
+        files[path.name] = _stored(store, at, read_bytes(path), old)
     version = Version(
         head.next, before.name if before else "", files, {**(before.sessions if before else {}), **sessions},
-        tuple(changes), software, by, f"versions/{head.next:05d}-{by}.json",
+        tuple(changes), software, by, f"versions/{at}.json",
     )  # fmt: skip
     objects.create(store / version.name, version.text())
     try:
@@ -191,34 +211,20 @@ def _exchange(store: Remote, head: Head) -> None:
         raise objects.Changed(f"another program has written a version of {store} meanwhile: run this again") from None
 
 
-def _stored(store: Remote, data: bytes, old: StoredFile | None) -> StoredFile:
-    """Write a file's objects, as far as they are not there. Their names are those of their content."""
+def _stored(store: Remote, at: str, data: bytes, old: StoredFile | None) -> StoredFile:
+    """Write a file's objects into a version's folder, unless the parent has the same file."""
     digest = hashlib.sha256(data).hexdigest()
     if old is not None and old.sha256 == digest:
         return old
     whole = compressed(data)
-    _put(store / whole_name(digest), whole)
-    if old is None:
-        return StoredFile(digest, len(data), len(whole))
-    differences = patch(read_file(store, old), data)
-    if len(differences) >= len(whole):
-        return StoredFile(digest, len(data), len(whole))
-    _put(store / patch_name(old.sha256, digest), differences)
-    return StoredFile(digest, len(data), len(whole), len(differences), old.sha256)
-
-
-def _put(remote: Remote, data: bytes) -> None:
-    """Equal names have equal content, whoever writes it, up to the version of the compression: written once."""
-    if not objects.exists(remote):
-        objects.write(remote, data)
-
-
-def whole_name(digest: str) -> str:
-    return f"files/{digest}.zst"
-
-
-def patch_name(old: str, new: str) -> str:
-    return f"patches/{old}-{new}.zst"
+    differences = patch(read_file(store, old), data) if old is not None else whole
+    if old is None or len(differences) >= len(whole):
+        made = StoredFile(digest, len(data), len(whole), at=at)
+    else:
+        made = StoredFile(digest, len(data), len(whole), len(differences), old.sha256, at)
+        objects.write(store / made.differences, differences)
+    objects.write(store / made.whole, whole)
+    return made
 
 
 def read_file(store: Remote, file: StoredFile) -> bytes:
@@ -227,7 +233,7 @@ def read_file(store: Remote, file: StoredFile) -> bytes:
     Raises:
         StereoSfmError: it is not what was written.
     """
-    remote = store / whole_name(file.sha256)
+    remote = store / file.whole
     data = expanded(objects.read(remote), file.bytes)
     if data is None or hashlib.sha256(data).hexdigest() != file.sha256:
         raise StereoSfmError(f"{remote} is damaged (its checksum is wrong): roll back, or write the version again")
@@ -244,15 +250,49 @@ def roll_back(store: Remote) -> Version:
     """
     head = read_head(store)
     now = current(store)
-    if not now.parent:
+    before = read_version(store, now.parent) if now.parent else None
+    if before is None or before.number < head.oldest:
         raise StereoSfmError(f"no earlier version of {store} is kept")
-    before = read_version(store, now.parent)
     refused = sorted({*head.refused, *(now.sessions.keys() - before.sessions.keys())})
     _exchange(store, dataclasses.replace(head, version=before.name, refused=tuple(refused), by=secrets.token_hex(8)))
     given, tag = _released(store)
     if now.name in given.values():
         _give(store, {robot: name for robot, name in given.items() if name != now.name}, tag)
     return before
+
+
+def forget_versions(store: Remote, keep: int) -> int:
+    """Delete the files of all but the last `keep` versions and those that robots were given.
+
+    What a version is made of stays known (`history`). The head is exchanged first: who began before begins again.
+
+    Returns:
+        Bytes that were deleted.
+
+    Raises:
+        Changed: another program has written a version meanwhile; nothing was deleted.
+    """
+    head = read_head(store)
+    last = history(store)[:keep] if head.version else []
+    if len(last) < keep or last[-1].number <= head.oldest:
+        return 0
+    oldest = last[-1].number
+    _exchange(store, dataclasses.replace(head, oldest=oldest, by=secrets.token_hex(8)))
+    given, _ = _released(store)
+    found = objects.listed(store)
+    kept = {name for name, _, _ in found if (m := _MANIFEST.fullmatch(name)) and int(m[1]) >= oldest}
+    named: set[str] = set()
+    for name in sorted(kept.union(given.values())):
+        with contextlib.suppress(objects.Missing):  # of a writer who was refused meanwhile
+            for file in read_version(store, name).files.values():
+                named |= {file.whole, file.differences}
+    gone = {
+        name: size
+        for name, size, _ in found
+        if name not in named and (m := _CONTENT.fullmatch(name)) and int(m[1] or 0) < oldest
+    }
+    objects.delete([store / name for name in gone])
+    return sum(gone.values())
 
 
 # -- staged roll-out ---------------------------------------------------------------------------------------------
@@ -262,10 +302,13 @@ def release(store: Remote, number: int, robots: tuple[str, ...] = ()) -> None:
     """Give a version to some robots, or to all of them.
 
     Raises:
-        StereoSfmError: there is no such version. Changed: another program has released one meanwhile.
+        StereoSfmError: there is no such version, or its files were deleted.
+        Changed: another program has released one meanwhile.
     """
     name = numbered(store, number).name
     given, tag = _released(store)
+    if number < read_head(store).oldest and name not in given.values():
+        raise StereoSfmError(f"the files of version {number} of {store} were deleted: it is too old (keep_versions)")
     given = {**given, **dict.fromkeys(robots, name)} if robots else {"": name}
     _give(store, given, tag)
 

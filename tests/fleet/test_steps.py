@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import io
+import os
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -14,10 +19,12 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export import store_plan
 from stereo_sfm.fleet.catalogue import ask, opened
 from stereo_sfm.fleet.copies import fetch_version
+from stereo_sfm.fleet.editing import checked_out
 from stereo_sfm.fleet.plan import Plan, Walk, find_walks, load_plan, night_of
-from stereo_sfm.fleet.run import forget_images, jobs_of
+from stereo_sfm.fleet.run import forget_images, forget_versions, jobs_of
 from stereo_sfm.fleet.steps import update_store
-from stereo_sfm.fleet.versions import current, roll_back
+from stereo_sfm.fleet.versions import current, numbered, roll_back
+from stereo_sfm.fleet.work_folder import work_folder
 from stereo_sfm.jobs import Job, Result
 from stereo_sfm.maps import put_session as put_session_module
 from stereo_sfm.maps.put_session import put_session
@@ -146,6 +153,48 @@ def test_old_recordings_without_a_date_or_an_end_are_deleted_too(plan: Plan, ses
     assert forget_images(plan, found, datetime.date(2026, 11, 26), waiting) == 0
     later = datetime.date.today() + datetime.timedelta(400)
     assert forget_images(plan, found, later, waiting) > 3 and find_walks(plan) == ([], [])
+
+
+def test_old_versions_go_as_the_plan_says(plan: Plan, session: Path, tmp_path: Path) -> None:
+    place = plan.root / STORE / "map"
+    send_folder(session, walks(plan) / "r1" / "2026-11-25_2200")
+    carry_out(plan)
+    with checked_out(place) as out:
+        (out.folder / "note.txt").write_text("x" * 1000)
+        out.publish({}, ["a note"])
+    assert forget_versions(plan, [STORE, "other"]) == 0  # all are kept
+    few = dataclasses.replace(plan, fleet=dataclasses.replace(plan.fleet, keep_versions=1))
+    assert forget_versions(few, [STORE, "other"]) == 0  # nothing but the head's, which has all files of before
+    with checked_out(place) as out:
+        (out.folder / "note.txt").write_text("y" * 1000)
+        out.publish({}, ["another"])
+    assert forget_versions(few, [STORE, "other"]) > 10
+    fetch_version(place, current(place), tmp_path / "robot")
+    assert same(load_map(tmp_path / "robot").snapshot, load_map(session).snapshot)
+    with pytest.raises(StereoSfmError, match="there is no"):
+        fetch_version(place, numbered(place, 2), tmp_path / "other")
+
+
+def test_what_a_killed_job_left_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    job = "from stereo_sfm.fleet.work_folder import work_folder\nwith work_folder() as f: print(f, flush=True); input()"
+    jobs = [
+        subprocess.Popen(
+            [sys.executable, "-c", job], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            env={**os.environ, "TMPDIR": str(tmp_path)},
+        )
+        for _ in range(2)
+    ]  # fmt: skip
+    killed, alive = (Path(p.stdout.readline().decode().strip()) for p in jobs if p.stdout is not None)
+    jobs[0].kill()
+    jobs[0].wait()
+    for folder in (killed, alive):
+        (folder / "images.mcap").write_bytes(b"people")
+        os.utime(folder, (0, 0))
+    with work_folder() as mine:
+        assert not killed.exists() and (alive / "images.mcap").is_file() and mine.is_dir()
+    jobs[1].communicate(b"\n")
+    assert not alive.exists() and not mine.exists()
 
 
 def test_a_damaged_step_is_made_again(plan: Plan, session: Path) -> None:

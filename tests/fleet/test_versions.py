@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 from pathlib import Path
 
@@ -15,10 +16,11 @@ from stereo_sfm.fleet import copies
 from stereo_sfm.fleet.copies import fetch_version, version_of
 from stereo_sfm.fleet.editing import checked_out
 from stereo_sfm.fleet.versions import (
+    StoredFile,
     current,
+    forget_versions,
     history,
     numbered,
-    patch_name,
     publish,
     read_head,
     release,
@@ -101,17 +103,17 @@ def test_damage_in_the_bucket_leaves_the_robot_as_it_was(place: str, tmp_path: P
     store, made, robot = Remote.of(place), tmp_path / "made", tmp_path / "robot"
     publish_night(store, made, 0)
     fetch_version(store, current(store), robot)
-    before, old = content(robot), current(store).files["observations.npz"]
+    before = content(robot)
     publish_night(store, made, 1)
     new = current(store).files["observations.npz"]
-    patch = store / patch_name(old.sha256, new.sha256)
+    patch = store / new.differences
     objects.write(patch, objects.read(patch)[:-100])
     assert fetch_version(store, current(store), robot).received > 1_000_000  # the whole file instead
     assert content(robot) == content(made)
     roll_back(store)
     fetch_version(store, current(store), robot)
     assert content(robot) == before
-    whole = store / f"files/{new.sha256}.zst"
+    whole = store / new.whole
     objects.write(whole, objects.read(whole)[:-100])
     with pytest.raises(StereoSfmError, match="is damaged"):
         fetch_version(store, numbered(store, 2), robot)
@@ -172,6 +174,63 @@ def test_a_version_is_released_to_some_robots_first(place: str, tmp_path: Path) 
         release(store, 9)
 
 
+def test_old_versions_lose_their_files_and_nothing_else(place: str, tmp_path: Path) -> None:
+    store, made, late = Remote.of(place), tmp_path / "made", tmp_path / "late"
+    wanted: dict[int, dict[str, bytes]] = {}
+    for night in range(6):
+        publish_night(store, made, night)
+        wanted[night + 1] = content(made)
+        if night == 1:
+            fetch_version(store, current(store), late)
+    release(store, 2, ("r7",))
+    began = read_head(store)
+    assert forget_versions(store, 7) == 0
+    assert forget_versions(store, 3) > 1_000_000 and forget_versions(store, 3) == 0
+    for number in (2, 4, 5, 6):  # the last three, and a robot's
+        fetch_version(store, numbered(store, number), tmp_path / f"v{number}")
+        assert content(tmp_path / f"v{number}") == wanted[number]
+    fetch_version(store, current(store), late)  # three nights behind: the differences are there no more
+    assert content(late) == wanted[6]
+    with pytest.raises(StereoSfmError, match="there is no"):
+        fetch_version(store, numbered(store, 3), tmp_path / "v3")
+    with pytest.raises(StereoSfmError, match="were deleted"):
+        release(store, 3)
+    with pytest.raises(Changed):  # a program that began before
+        publish(store, made, began, {}, [], "test")
+    assert [v.number for v in history(store)] == [6, 5, 4, 3, 2, 1]
+    assert [roll_back(store).number for _ in range(2)] == [5, 4]
+    with pytest.raises(StereoSfmError, match="no earlier version"):
+        roll_back(store)
+    fetch_version(store, numbered(store, 6), late)  # rolled back, and younger than the oldest one that is kept
+    assert content(late) == wanted[6]
+
+
+def test_a_store_of_before_has_one_folder_of_files(place: str, tmp_path: Path) -> None:
+    """Its versions are read, followed by new ones, and forgotten."""
+    store, made = Remote.of(place), tmp_path / "made"
+    for night in (0, 1):
+        publish_night(store, made, night)
+        version = current(store)
+        data = json.loads(objects.read(store / version.name))
+        for name, file in version.files.items():
+            at = data["files"][name].pop("at")
+            if at in version.name:
+                before = StoredFile(**data["files"][name])
+                objects.write(store / before.whole, objects.read(store / file.whole))
+                if file.patched:
+                    objects.write(store / before.differences, objects.read(store / file.differences))
+        objects.write(store / version.name, json.dumps(data).encode())
+        objects.delete(store / name for name, _, _ in objects.listed(store) if re.match("(files|patches)/.*/", name))
+    fetch_version(store, numbered(store, 1), tmp_path / "robot")
+    assert 0 < fetch_version(store, current(store), tmp_path / "robot").received < 300_000
+    assert content(tmp_path / "robot") == content(made)
+    publish_night(store, made, 2)
+    assert fetch_version(store, current(store), tmp_path / "robot").received < 300_000
+    assert forget_versions(store, 1) > 1_000_000
+    fetch_version(store, current(store), tmp_path / "other")
+    assert content(tmp_path / "other") == content(tmp_path / "robot") == content(made)
+
+
 def test_without_a_network_a_robot_keeps_its_version(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -188,6 +247,23 @@ def test_without_a_network_a_robot_keeps_its_version(
     assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
     assert "stays version 1" in capsys.readouterr().err and content(tmp_path / "robot") == before
     assert main(["map", "fetch", place, str(tmp_path / "other")]) == StereoSfmError.exit_code
+
+
+def test_without_a_network_a_map_is_read_as_it_was_fetched_last(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = Remote.of(place)
+    publish_night(store, tmp_path / "made", 0)
+    assert content(copies.fetched(store)) == content(tmp_path / "made")
+
+    def away(remote: Remote) -> None:
+        raise Unreachable(f"cannot read {remote}: no answer after 12 tries")
+
+    for name in ("read_tagged", "exists"):
+        monkeypatch.setattr(objects, name, away)
+    assert content(copies.fetched(store)) == content(tmp_path / "made") and "stays version 1" in caplog.text
+    with pytest.raises(Unreachable):
+        copies.fetched(store / "other")
 
 
 def test_what_is_no_store_is_one_line(place: str, s3: Server) -> None:
