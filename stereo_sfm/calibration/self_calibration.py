@@ -1,19 +1,20 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
 Every few keyframes with motion form a window (`rig_window`). The terms of the rig are estimated from all windows with
-the deviations that the windows' scatter shows (`rig_course`). Terms are corrected that differ from the current ones by
-several of these, that both halves of the windows (even and odd ones) confirm, and whose correction by one half makes
-rows and reprojections of the other half better. Once one is, others follow that are likely wrong. The rows show terms
-of lenses, which change lengths by what the lens model says of disparities: lengths stay unless there is evidence about
-them. A corrected term is refined as long as windows come, first whenever their number has doubled; one that moves by
-more than its deviation allowed, and then is not significant any more, is taken back for good. Points are tracked where
-a wrong rig expects them, and agree with it a little: once there are enough windows since a large correction, those
-before it are discarded. Where the windows show drift (temperature), the rig is known to be wrong: the terms at the
-newest window are used from it on, and the windows since the last revision are on the way there.
+the deviations that the scatter of the windows shows, and that of the places in the image (`rig_course`). Terms are
+corrected that differ from the current ones by several of these, that both halves of the windows (even and odd ones)
+confirm, and whose correction by one half makes rows and reprojections of the other half better. Once one is, others
+follow that are likely wrong. The rows show terms of lenses, which change lengths by what the lens model says of
+disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows come,
+first whenever their number has doubled; one that moves by more than its deviation allowed, and then is not significant
+any more, is taken back for good. Points are tracked where a wrong rig expects them, and agree with it a little: once
+there are enough windows since a large correction, those before it are discarded. Where the windows show drift
+(temperature), the rig is known to be wrong: the terms at the newest window are used from it on, and the windows since
+the last revision are on the way there.
 
 A sudden rotation of the right camera is noticed and measured by the tracker (`tracking.flow.sudden_turn`). Once it has
-stayed for some keyframes, the rig is corrected by it from the first of these on, and what the windows before it showed
-of the rig goes on to hold for the rig so turned.
+stayed for some keyframes, which are better explained by it, the rig is corrected by it from the first of these on, and
+what the windows before it showed of the rig goes on to hold for the rig so turned.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import numpy as np
 
 from stereo_sfm.calib.choice import NAMES, SCALES, SIGMAS, UNITS, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calibration.rig_course import constant, steady
+from stereo_sfm.calibration.rig_course import by_place, constant, steady
 from stereo_sfm.calibration.rig_window import LENSES, RigWindow, SeenPoints, solve_window
 from stereo_sfm.config import Config
 from stereo_sfm.types import F64, RIG_TERMS, Bool, CalibrationUpdate, Keyframe
@@ -42,16 +43,16 @@ INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
 # than these, come from one revision to the next.
 ENOUGH_WINDOWS = 4
 MAX_WINDOWS = 80  # used, the newest: what changes slowly is followed
-# Of others, once the calibration is known to be wrong: Akaike's criterion, but for those by which cameras err least.
-FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [3, 4, 6, 7]), SIGMAS, np.sqrt(2.0))
+AKAIKE_SIGMAS = np.sqrt(2.0)  # of a term that drifts (Akaike's criterion)
+# Of others, once the calibration is known to be wrong: the same, but for that which changes lengths, of which no other
+# one tells anything, and those by which cameras err least.
+FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [1, 3, 4, 6, 7]), SIGMAS, AKAIKE_SIGMAS)
 REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
 # Standard deviations, of one in 370 by chance and of one in 44 (one-sided):
 HUNTING_SIGMAS = 3.0  # by which a refinement moves a term that is taken back unless it is still significant
 HELPING_SIGMAS = 2.0  # by which a correction makes windows better that it was not estimated from
 MISLED_SHARE = 0.05  # of a rig's error that remains in what is estimated from points tracked with it
 MATCHING_PX = 0.02  # px, systematic error of matching, which all windows share
-# Bias of the terms of lenses, px at the border over the noise of a pixel: distances are a nonlinear function of pixels.
-BIAS_SHARE = 0.5
 WINDOW_PX = 0.05  # px, that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
 DIRECTION = np.deg2rad(0.15)  # radians, systematic error of the baseline's direction: of matching, by distance
 
@@ -104,7 +105,7 @@ class SelfCalibration:
         """Add a keyframe; returns a revision when one becomes significant."""
         seen, self._stamp_ns = SeenPoints.of(keyframe), keyframe.stamp_ns
         self._rolling |= keyframe.readout_s != 0
-        turned = self._sudden_turn(keyframe)
+        turned = self._sudden_turn(keyframe, seen)
         if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
         moved = not self._keyframes or _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width)
@@ -136,14 +137,12 @@ class SelfCalibration:
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
-        return self._beyond(self.terms, constant(windows, self._expected).at([1.0]))
+        return self._beyond(self.terms, constant(windows, self._expected).at([1.0]), by_place(windows))
 
-    def _beyond(self, terms: F64, found: Estimate) -> Estimate:
-        """The change from `terms`, with errors that all windows share."""
-        px = np.full(RIG_TERMS, MATCHING_PX)
-        px[LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
-        shared = np.minimum(px * self._of_pixel, DIRECTION)
-        return Estimate(found.value - terms, found.covariance + np.diag(shared**2), found.freedom)
+    def _beyond(self, terms: F64, found: Estimate, by_place: F64) -> Estimate:
+        """The change from `terms`, with errors that all windows share: those `by_place` (8, 8), and of matching."""
+        shared = np.minimum(MATCHING_PX * self._of_pixel, DIRECTION)
+        return Estimate(found.value - terms, found.covariance + by_place + np.diag(shared**2), found.freedom)
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -211,9 +210,10 @@ class SelfCalibration:
         courses = [] if drift else [constant(part, self._expected).at([1.0]) for part in (windows, *halves)]
         ignored = self._taken_back | (len(windows) < INTRODUCED)
         found = drift.at_the_end if drift else courses
-        whole, *parts = [self._beyond(kept, f).by(basis).ignoring(ignored) for f in found]
-        wrong = drift.terms if drift and not self._corrected.any() else self._corrected.any()
-        new = np.where(ignored, np.inf, np.where(wrong, FURTHER_SIGMAS, SIGMAS))
+        shared = by_place(windows)
+        whole, *parts = [self._beyond(kept, f, shared).by(basis).ignoring(ignored) for f in found]
+        new = np.where(self._corrected.any(), FURTHER_SIGMAS, SIGMAS)
+        new = np.where(ignored, np.inf, np.where(drift.terms, AKAIKE_SIGMAS, new) if drift else new)
         sigmas, back = np.where(self._corrected, refined_sigmas, new), kept - self.terms
         choice = choose(whole, parts, self._rolling, sigmas, self._corrected)
         if not (drift or self._helps(halves, [p.without(choice.selected).value for p in parts], basis, back)):
@@ -241,18 +241,27 @@ class SelfCalibration:
         ])  # fmt: skip
         return bool(gains.mean() > HELPING_SIGMAS * gains.std() / np.sqrt(len(gains) - 1))
 
-    def _sudden_turn(self, keyframe: Keyframe) -> Revision | None:
-        """The revision of a rotation that the tracker noticed, once it has stayed the same for some keyframes.
+    def _sudden_turn(self, keyframe: Keyframe, seen: SeenPoints) -> Revision | None:
+        """The revision of a rotation that the tracker noticed, once some keyframes have shown it, too.
 
-        What the windows before it said of the rig goes on to hold, for the rig so turned.
+        What the windows before it said of the rig goes on to hold, for the rig so turned. If the keyframes since then
+        are better explained by the rig as it was, it stays so.
         """
         if not np.array_equal(keyframe.right_turn, self._turn):
             self._turn, self._keyframes = keyframe.right_turn, []
             self._turned_kf_id = keyframe.kf_id if self._turn.any() else -1
-        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + KEYFRAMES - 1:
+        since = [k for k in [*self._keyframes, seen] if k.submap_id == seen.submap_id][-KEYFRAMES:]
+        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + KEYFRAMES - 1 or len(since) < KEYFRAMES - 1:
+            return None
+        window = solve_window(self._rig, since, self.terms)
+        if window is None:
             return None
         change, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
         change[:3] = self._turn
+        before = constant(self.windows, self._expected).at([1.0]).value if self.windows else self.terms
+        if window.information.gain(before, change) < 0.0:
+            self._keyframes, self._turned_kf_id = [], -1
+            return None
         covariance[:3, :3] = keyframe.right_turn_covariance
         sigma = np.sqrt(np.diag(covariance))
         self.windows = deque((w.turned(change) for w in self.windows), maxlen=MAX_WINDOWS)

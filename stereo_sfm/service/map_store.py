@@ -29,6 +29,7 @@ from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
+from stereo_sfm.pipeline.allocator import release_memory
 from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.fork_server import start_context
 from stereo_sfm.pipeline.watchdog import STOPPED, process_state
@@ -249,6 +250,7 @@ def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests:
             if join:
                 with step:
                     send.send(Joined(why=why) if growing is None else _grown(growing, session, out))
+                    release_memory()  # maps of a day come and go
                 work.set()
 
 

@@ -161,6 +161,16 @@ def noticed(
 
 
 @pytest.mark.parametrize("name", RIGS)
+@pytest.mark.parametrize("degrees", [(0.1, 0.0, 0.0), (0.0, -0.2, 0.0), (0.1, -0.3, 0.0)])
+def test_a_noticed_rotation_that_no_keyframe_shows_is_no_step(name: str, degrees: tuple[float, float, float]) -> None:
+    true, turn = RIGS[name], np.deg2rad(degrees)
+    estimator = SelfCalibration(true)
+    found = [r for k in noticed([true] * 48, true, 0, 20, turn) if (r := estimator.add(k)) is not None]
+    assert not [r for r in found if r.why == "step"]
+    assert np.abs(np.rad2deg(estimator.terms[:3])).max() < 0.02 and estimator.windows[-1].first_kf_id > 30
+
+
+@pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("degrees", [(0.0, 0.1, 0.0), (0.0, -0.2, 0.0), (0.0, 0.0, 0.4)])
 def test_a_noticed_rotation_is_a_step_once_it_has_stayed(name: str, degrees: tuple[float, float, float]) -> None:
     true = RIGS[name]
