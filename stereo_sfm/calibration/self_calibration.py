@@ -245,21 +245,19 @@ class SelfCalibration:
         """The revision of a rotation that the tracker noticed, once some keyframes have shown it, too.
 
         What the windows before it said of the rig goes on to hold, for the rig so turned. If the keyframes since then
-        are better explained by the rig as it was, it stays so.
+        are better explained by the rig as it was, it stays so; those of a robot at rest say nothing else.
         """
         if not np.array_equal(keyframe.right_turn, self._turn):
             self._turn, self._keyframes = keyframe.right_turn, []
             self._turned_kf_id = keyframe.kf_id if self._turn.any() else -1
-        since = [k for k in [*self._keyframes, seen] if k.submap_id == seen.submap_id][-KEYFRAMES:]
-        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + KEYFRAMES - 1 or len(since) < KEYFRAMES - 1:
-            return None
-        window = solve_window(self._rig, since, self.terms)
-        if window is None:
+        if self._turned_kf_id < 0 or keyframe.kf_id < self._turned_kf_id + KEYFRAMES - 1:
             return None
         change, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
         change[:3] = self._turn
+        since = [k for k in [*self._keyframes, seen] if k.submap_id == seen.submap_id][-KEYFRAMES:]
+        window = solve_window(self._rig, since, self.terms) if len(since) >= KEYFRAMES - 1 else None
         before = constant(self.windows, self._expected).at([1.0]).value if self.windows else self.terms
-        if window.information.gain(before, change) < 0.0:
+        if window is not None and window.information.gain(before, change) < 0.0:
             self._keyframes, self._turned_kf_id = [], -1
             return None
         covariance[:3, :3] = keyframe.right_turn_covariance
