@@ -35,6 +35,7 @@ STEPS = 4  # of Gauss-Newton: two that find what does not fit, two without it
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandths of a pixel
 NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit
 LENSES = slice(5, 8)  # focal ratio and decentering
+LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these
 # Prior standard deviations of the terms, radians, radians, ratio, radians: wide enough for a step of half a degree.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
@@ -93,7 +94,7 @@ class RigWindow:
     information: RigInformation
     by_place: RigInformation  # (P, 8, 8) and (P, 8): what the points of each region of the image say of it
     noise_px: float
-    length: F64  # (8,) relative change of lengths by each term, per radian or ratio
+    length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
     turn: F64  # (3,) radians from the first to the last keyframe
 
     def turned(self, change: F64) -> RigWindow:
@@ -138,28 +139,28 @@ def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWi
     rows, last = _rows(corrected, problem, sigma, hard=True), keyframes[-1]
     turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:]
     about = _information(rows, terms, problem.lens, regions(rig.left, problem.uv[:, 0, 0]))
-    length = _length_by_terms(rig, keyframes[0])
+    length = _length_by_terms(rig, problem.uv[:, 0, 0], problem.uv[:, 0, 1])
     return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, *about, _noise(rows[0]), length, turn)
 
 
-def _length_by_terms(rig: Rig, keyframe: SeenPoints) -> F64:
-    """(8,) relative change by each term of the motion that the rig measures with a keyframe's points, least squares.
+def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
+    """(8,) relative change by LENGTHENING terms of the motion that the rig measures with points (N, 2), least squares.
 
-    Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2). Those that
-    are soon out of view count: they are near.
+    Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2).
     """
-    rho = inverse_distances(rig, keyframe.uv_left, keyframe.uv_right)
+    rho = inverse_distances(rig, uv_left, uv_right)
     used, out = np.isfinite(rho), np.zeros(RIG_TERMS)
-    for k, changed in enumerate(_varied(rig)):
-        change = inverse_distances(changed, keyframe.uv_left, keyframe.uv_right) - rho
+    for k, changed in zip(LENGTHENING, _lengthened(rig), strict=True):
+        change = inverse_distances(changed, uv_left, uv_right) - rho
         out[k] = (rho * change)[used & np.isfinite(change)].sum()
     return -out / (DERIVATIVE * max(float((rho[used] ** 2).sum()), 1e-12))
 
 
 @functools.lru_cache(maxsize=1)
-def _varied(rig: Rig) -> tuple[Rig, ...]:
-    """The rig, which is the same for all windows of a run, with a little more of each term."""
-    return tuple(with_terms(rig, step) for step in DERIVATIVE * np.eye(RIG_TERMS))
+def _lengthened(rig: Rig) -> tuple[Rig, ...]:
+    """The rig, which is the same for all windows of a run, with a little more of each of the LENGTHENING terms."""
+    steps = DERIVATIVE * np.eye(RIG_TERMS)
+    return tuple(with_terms(rig, steps[k]) for k in LENGTHENING)
 
 
 def _problem(rig: Rig, keyframes: Sequence[SeenPoints]) -> _Problem | None:

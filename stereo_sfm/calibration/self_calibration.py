@@ -43,10 +43,8 @@ INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])
 # than these, come from one revision to the next.
 ENOUGH_WINDOWS = 4
 MAX_WINDOWS = 80  # used, the newest: what changes slowly is followed
-AKAIKE_SIGMAS = np.sqrt(2.0)  # of a term that drifts (Akaike's criterion)
-# Of others, once the calibration is known to be wrong: the same, but for that which changes lengths, of which no other
-# one tells anything, and those by which cameras err least.
-FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [1, 3, 4, 6, 7]), SIGMAS, AKAIKE_SIGMAS)
+# Of others, once the calibration is known to be wrong: Akaike's criterion, but for those by which cameras err least.
+FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [3, 4, 6, 7]), SIGMAS, np.sqrt(2.0))
 REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
 # Standard deviations, of one in 370 by chance and of one in 44 (one-sided):
 HUNTING_SIGMAS = 3.0  # by which a refinement moves a term that is taken back unless it is still significant
@@ -212,8 +210,8 @@ class SelfCalibration:
         found = drift.at_the_end if drift else courses
         shared = by_place(windows)
         whole, *parts = [self._beyond(kept, f, shared).by(basis).ignoring(ignored) for f in found]
-        new = np.where(self._corrected.any(), FURTHER_SIGMAS, SIGMAS)
-        new = np.where(ignored, np.inf, np.where(drift.terms, AKAIKE_SIGMAS, new) if drift else new)
+        wrong = drift.terms if drift and not self._corrected.any() else self._corrected.any()
+        new = np.where(ignored, np.inf, np.where(wrong, FURTHER_SIGMAS, SIGMAS))
         sigmas, back = np.where(self._corrected, refined_sigmas, new), kept - self.terms
         choice = choose(whole, parts, self._rolling, sigmas, self._corrected)
         if not (drift or self._helps(halves, [p.without(choice.selected).value for p in parts], basis, back)):
