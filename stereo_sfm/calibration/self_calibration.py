@@ -51,6 +51,8 @@ HUNTING_SIGMAS = 3.0  # by which a refinement moves a term that is taken back un
 HELPING_SIGMAS = 2.0  # by which a correction makes windows better that it was not estimated from
 MISLED_SHARE = 0.05  # of a rig's error that remains in what is estimated from points tracked with it
 MATCHING_PX = 0.02  # px, systematic error of matching, which all windows share
+# Bias of the terms of lenses, px at the border over the noise of a pixel: distances are a nonlinear function of pixels.
+BIAS_SHARE = 0.5
 WINDOW_PX = 0.05  # px, that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
 DIRECTION = np.deg2rad(0.15)  # radians, systematic error of the baseline's direction: of matching, by distance
 
@@ -139,7 +141,9 @@ class SelfCalibration:
 
     def _beyond(self, terms: F64, found: Estimate, by_place: F64) -> Estimate:
         """The change from `terms`, with errors that all windows share: those `by_place` (8, 8), and of matching."""
-        shared = np.minimum(MATCHING_PX * self._of_pixel, DIRECTION)
+        px = np.full(RIG_TERMS, MATCHING_PX)
+        px[LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
+        shared = np.minimum(px * self._of_pixel, DIRECTION)
         return Estimate(found.value - terms, found.covariance + by_place + np.diag(shared**2), found.freedom)
 
     def _close_window(self) -> bool:

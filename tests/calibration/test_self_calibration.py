@@ -140,7 +140,7 @@ def test_lengths_stay_without_evidence_about_them() -> None:
     believed = RIGS["pinhole"]
     terms = np.zeros(RIG_TERMS)
     terms[6] = 0.004
-    estimator, found = revisions(with_terms(believed, terms), believed, 0)
+    estimator, found = revisions(with_terms(believed, terms), believed, 0, count=64)
     length = np.mean([w.length for w in estimator.windows], axis=0)
     alone = abs(length[6] * estimator.terms[6])
     assert found and alone > 0.005 and abs(length @ estimator.terms) < 0.4 * alone
