@@ -83,24 +83,6 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: F64
     return Course(values, grown * covariance[:size, :size], freedom - kinds)
 
 
-def by_place(windows: Sequence[RigWindow]) -> F64:
-    """(8, 8) covariance of a constant rig's terms by the place in the image, beyond noise: lenses err by place.
-
-    Estimated without the points of one region after the other (the jackknife: Tukey, Ann. Math. Stat. 29, 1958).
-    """
-    matrices = np.sum([w.by_place.matrix for w in windows], axis=0)
-    vectors = np.sum([w.by_place.vector for w in windows], axis=0)
-    seen = np.flatnonzero(np.trace(matrices, axis1=1, axis2=2) > 0)
-    whole = matrices.sum(0) + np.diag(PRIOR**-2)
-    without = np.linalg.solve(whole - matrices[seen], (vectors.sum(0) - vectors[seen])[..., None])[..., 0]
-    off = without - without.mean(0)
-    found = (1 - 1 / max(len(seen), 1)) * off.T @ off
-    # in units of noise, of which one is expected
-    noise = np.linalg.cholesky(np.linalg.inv(whole))
-    size, axes = np.linalg.eigh(np.linalg.solve(noise, np.linalg.solve(noise, found).T))
-    return np.asarray((noise @ axes * np.maximum(size - 1, 0)) @ (noise @ axes).T, float)
-
-
 def _alike(error: F64, scatter: F64) -> float:
     """Correlation of the errors (N, 8) of neighbouring windows, from 0 to MOST_ALIKE.
 

@@ -4,8 +4,7 @@ A separate bundle adjustment of the window's keyframes, the points that its firs
 eight terms of the rig (`calib.choice`): rotation of the right camera, direction of the baseline, focal length of the
 right camera relative to the left, decentering of the right lens relative to the left. Points and motion are unknowns
 too, so errors of disparity, which are correlated with the motion, are estimated as well. The result is the information
-about the terms with points and motion eliminated; that of several windows is summed. It is the sum of what each region
-of the image says: lenses err by place, the same in all windows.
+about the terms with points and motion eliminated; that of several windows is summed.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.elimination import OUTLIER_SIGMAS, Eliminated, point_noise, robust_weights
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
-from stereo_sfm.calibration.row_errors import GRID, regions
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import PINHOLE, RADTAN
@@ -74,10 +72,6 @@ class RigInformation:
     matrix: F64  # (8, 8)
     vector: F64  # (8,) matrix @ (the terms that fit best)
 
-    def turned(self, change: F64) -> RigInformation:
-        """If the rig's terms had been others, by `change` (8,)."""
-        return RigInformation(self.matrix, self.vector + self.matrix @ change)
-
     def gain(self, terms: F64, change: F64) -> float:
         """By how much a change (8,) of terms (8,) lowers the cost of rows and reprojections, in standard deviations."""
         size = change @ self.matrix @ change
@@ -92,15 +86,14 @@ class RigWindow:
     last_kf_id: int
     stamp_ns: int  # of the last keyframe
     information: RigInformation
-    by_place: RigInformation  # (P, 8, 8) and (P, 8): what the points of each region of the image say of it
     noise_px: float
     length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
     turn: F64  # (3,) radians from the first to the last keyframe
 
     def turned(self, change: F64) -> RigWindow:
         """If the rig's terms had been others, by `change` (8,)."""
-        whole, part = self.information.turned(change), self.by_place.turned(change)
-        return replace(self, information=whole, by_place=part)
+        matrix, vector = self.information.matrix, self.information.vector
+        return replace(self, information=RigInformation(matrix, vector + matrix @ change))
 
 
 @dataclass(eq=False)
@@ -127,8 +120,7 @@ def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWi
         return None
     sigma = 1.0
     for step in range(STEPS):
-        rows = _rows(corrected, problem, sigma, hard=step >= 2)
-        system, sigma = Eliminated.of(*rows, len(SHARED_PRIOR)), _noise(rows[0])
+        system, sigma = _equations(corrected, problem, sigma, hard=step >= 2)
         pulled = system.gradient + SHARED_PRIOR * np.concatenate([terms, problem.lens])
         delta = np.asarray(-np.linalg.solve(system.matrix + np.diag(SHARED_PRIOR), pulled), float)
         terms, problem.lens = terms + delta[:RIG_TERMS], problem.lens + delta[RIG_TERMS:]
@@ -136,11 +128,12 @@ def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWi
         if not np.isfinite(terms).all():
             return None
         corrected = with_terms(rig, terms)
-    rows, last = _rows(corrected, problem, sigma, hard=True), keyframes[-1]
-    turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:]
-    about = _information(rows, terms, problem.lens, regions(rig.left, problem.uv[:, 0, 0]))
+    system, sigma = _equations(corrected, problem, sigma, hard=True)
+    last = keyframes[-1]
     length = _length_by_terms(rig, problem.uv[:, 0, 0], problem.uv[:, 0, 1])
-    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, *about, _noise(rows[0]), length, turn)
+    turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:]
+    information = _information(system, terms, problem.lens)
+    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma, length, turn)
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
@@ -196,23 +189,16 @@ def _shapes(camera: Camera, uv: F64) -> F64:
     return np.asarray(0.5 * camera.width * np.nan_to_num(np.stack([np.stack(u, -1), np.stack(v, -1)], -2)), float)
 
 
-_Rows = tuple[F64, F64, F64, F64]  # residuals, derivatives by the point and by the rest, weights
-
-
-def _rows(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> _Rows:
-    """The equations of the points at the problem's present state, as `Eliminated.of` takes them.
+def _equations(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> tuple[Eliminated, float]:
+    """The equations of the rig's terms and the lens's at the problem's present state, and the noise of a coordinate.
 
     Args: sigma, px, the scale of Cauchy's loss: tracks' errors have long tails, and lean to one side there.
     """
     residual, by_point, by_rest = _linearised(rig, problem)
     weight = robust_weights(residual, sigma, OUTLIER_SIGMAS * sigma if hard else np.inf) / sigma**2
-    return residual, by_point, by_rest, weight
-
-
-def _noise(residual: F64) -> float:
-    """Of a coordinate, px."""
     sizes = point_noise(residual)
-    return float(np.clip(median(sizes), *NOISE_PX)) if len(sizes) else NOISE_PX[1]
+    noise = float(np.clip(median(sizes), *NOISE_PX)) if len(sizes) else NOISE_PX[1]
+    return Eliminated.of(residual, by_point, by_rest, weight, len(SHARED_PRIOR)), noise
 
 
 def _linearised(rig: Rig, problem: _Problem) -> tuple[F64, F64, F64]:
@@ -255,21 +241,10 @@ def _linearised(rig: Rig, problem: _Problem) -> tuple[F64, F64, F64]:
     return residual.reshape(count, -1), by_point.reshape(count, -1, 3), by_rest.reshape(count, 4 * frames, -1)
 
 
-def _information(rows: _Rows, terms: F64, lens: F64, place: I64) -> tuple[RigInformation, RigInformation]:
-    """About the rig's terms alone, whatever the lens and the poses are: of all points, and of those of each place."""
-    residual, by_point, by_rest, weight = rows
-    most, own = by_rest.shape[2], slice(RIG_TERMS, None)
-    places = [place == k for k in range(GRID[0] * GRID[1])]
-    parts = [Eliminated.of(residual[at], by_point[at], by_rest[at], weight[at], most) for at in places]
-    matrices, gradients = np.stack([p.matrix for p in parts]), np.stack([p.gradient for p in parts])
-    matrix, gradient = matrices.sum(0), gradients.sum(0)
-    information, pull = np.full(most - RIG_TERMS, 1e-6), np.zeros(most)
-    information[: len(LENS_PRIOR)] = LENS_PRIOR**-2
-    pull[RIG_TERMS : RIG_TERMS + len(lens)] = lens / LENS_PRIOR**2
-    gain = np.linalg.solve(matrix[own, own] + np.diag(information), matrix[own, :RIG_TERMS]).T
-    alone = np.concatenate([np.eye(RIG_TERMS), -gain], axis=1)
-    whole, of_parts = alone @ matrix[:, :RIG_TERMS], alone @ matrices @ alone.T
-    return (
-        RigInformation(whole, whole @ terms - alone @ (gradient + pull)),
-        RigInformation(of_parts, of_parts @ terms - gradients @ alone.T),
-    )
+def _information(system: Eliminated, terms: F64, lens: F64) -> RigInformation:
+    """About the rig's terms alone, whatever the lens is."""
+    own = system.matrix[RIG_TERMS:, RIG_TERMS:] + np.diag(LENS_PRIOR**-2)
+    gain = np.linalg.solve(own, system.matrix[RIG_TERMS:, :RIG_TERMS]).T
+    matrix = system.matrix[:RIG_TERMS, :RIG_TERMS] - gain @ system.matrix[RIG_TERMS:, :RIG_TERMS]
+    gradient = system.gradient[:RIG_TERMS] - gain @ (system.gradient[RIG_TERMS:] + lens / LENS_PRIOR**2)
+    return RigInformation(matrix, matrix @ terms - gradient)

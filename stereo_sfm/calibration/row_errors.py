@@ -10,10 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import epipolar_angle
-from stereo_sfm.types import F64, I64, Keyframe, RowErrors
+from stereo_sfm.types import F64, Keyframe, RowErrors
 
 GRID = (3, 4)  # rows and columns of regions: a turn of a camera and an error of its lens look different in them
 SHARES = np.array([0.2, 0.04])  # weight of the newest keyframe in the averages: over about 5 and 25 keyframes
@@ -21,12 +20,6 @@ MIN_MATCHES = 5  # of a region, whose median two wrong ones then do not decide
 # Of the systematic part, the larger one of the two: matches are lost from 1 px on, and the same small turn of a camera
 # is many pixels of a long lens. Half a pixel is 0.05 degrees at a focal length of 573 px.
 WARN_PX, WARN_DEG = 0.5, 0.05
-
-
-def regions(camera: Camera, uv: F64) -> I64:
-    """(N,) the region of the image, counted along the rows of GRID, of pixels (N, 2)."""
-    cell = np.clip((uv * GRID[::-1] / camera.size).astype(int), 0, np.array(GRID[::-1]) - 1)
-    return np.asarray(cell[:, 1] * GRID[1] + cell[:, 0], np.int64)
 
 
 class RowMonitor:
@@ -59,7 +52,8 @@ class RowMonitor:
         uv = keyframe.uv_left[seen]
         bearings = self._rig.left.unproject(uv), self._rig.right.unproject(keyframe.uv_right[seen])
         error = self._rig.left.fx * epipolar_angle(*bearings, self._rig.left_T_right)
-        region = np.where(np.isfinite(error), regions(self._rig.left, uv), -1)
+        cell = np.clip((uv * GRID[::-1] / self._rig.left.size).astype(int), 0, np.array(GRID[::-1]) - 1)
+        region = np.where(np.isfinite(error), cell[:, 1] * GRID[1] + cell[:, 0], -1)
         out = np.full(GRID[0] * GRID[1], np.nan)
         for k in range(len(out)):
             here = error[region == k]

@@ -1,16 +1,15 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
 Every few keyframes with motion form a window (`rig_window`). The terms of the rig are estimated from all windows with
-the deviations that the scatter of the windows shows, and that of the places in the image (`rig_course`). Terms are
-corrected that differ from the current ones by several of these, that both halves of the windows (even and odd ones)
-confirm, and whose correction by one half makes rows and reprojections of the other half better. Once one is, others
-follow that are likely wrong. The rows show terms of lenses, which change lengths by what the lens model says of
-disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows come,
-first whenever their number has doubled; one that moves by more than its deviation allowed, and then is not significant
-any more, is taken back for good. Points are tracked where a wrong rig expects them, and agree with it a little: once
-there are enough windows since a large correction, those before it are discarded. Where the windows show drift
-(temperature), the rig is known to be wrong: the terms at the newest window are used from it on, and the windows since
-the last revision are on the way there.
+the deviations that the windows' scatter shows (`rig_course`). Terms are corrected that differ from the current ones by
+several of these, that both halves of the windows (even and odd ones) confirm, and whose correction by one half makes
+rows and reprojections of the other half better. Once one is, others follow that are likely wrong. The rows show terms
+of lenses, which change lengths by what the lens model says of disparities: lengths stay unless there is evidence about
+them. A corrected term is refined as long as windows come, first whenever their number has doubled; one that moves by
+more than its deviation allowed, and then is not significant any more, is taken back for good. Points are tracked where
+a wrong rig expects them, and agree with it a little: once there are enough windows since a large correction, those
+before it are discarded. Where the windows show drift (temperature), the rig is known to be wrong: the terms at the
+newest window are used from it on, and the windows since the last revision are on the way there.
 
 A sudden rotation of the right camera is noticed and measured by the tracker (`tracking.flow.sudden_turn`). Once it has
 stayed for some keyframes, which are better explained by it, the rig is corrected by it from the first of these on, and
@@ -27,7 +26,7 @@ import numpy as np
 
 from stereo_sfm.calib.choice import NAMES, SCALES, SIGMAS, UNITS, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calibration.rig_course import by_place, constant, steady
+from stereo_sfm.calibration.rig_course import constant, steady
 from stereo_sfm.calibration.rig_window import LENSES, RigWindow, SeenPoints, solve_window
 from stereo_sfm.config import Config
 from stereo_sfm.types import F64, RIG_TERMS, Bool, CalibrationUpdate, Keyframe
@@ -137,14 +136,14 @@ class SelfCalibration:
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
-        return self._beyond(self.terms, constant(windows, self._expected).at([1.0]), by_place(windows))
+        return self._beyond(self.terms, constant(windows, self._expected).at([1.0]))
 
-    def _beyond(self, terms: F64, found: Estimate, by_place: F64) -> Estimate:
-        """The change from `terms`, with errors that all windows share: those `by_place` (8, 8), and of matching."""
+    def _beyond(self, terms: F64, found: Estimate) -> Estimate:
+        """The change from `terms`, with errors that all windows share."""
         px = np.full(RIG_TERMS, MATCHING_PX)
         px[LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
         shared = np.minimum(px * self._of_pixel, DIRECTION)
-        return Estimate(found.value - terms, found.covariance + by_place + np.diag(shared**2), found.freedom)
+        return Estimate(found.value - terms, found.covariance + np.diag(shared**2), found.freedom)
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -212,8 +211,7 @@ class SelfCalibration:
         courses = [] if drift else [constant(part, self._expected).at([1.0]) for part in (windows, *halves)]
         ignored = self._taken_back | (len(windows) < INTRODUCED)
         found = drift.at_the_end if drift else courses
-        shared = by_place(windows)
-        whole, *parts = [self._beyond(kept, f, shared).by(basis).ignoring(ignored) for f in found]
+        whole, *parts = [self._beyond(kept, f).by(basis).ignoring(ignored) for f in found]
         wrong = drift.terms if drift and not self._corrected.any() else self._corrected.any()
         new = np.where(ignored, np.inf, np.where(wrong, FURTHER_SIGMAS, SIGMAS))
         sigmas, back = np.where(self._corrected, refined_sigmas, new), kept - self.terms
