@@ -29,7 +29,7 @@ from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
-from stereo_sfm.pipeline.allocator import release_memory
+from stereo_sfm.pipeline.allocator import release_memory, return_large_blocks, share_one_heap
 from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.fork_server import start_context
 from stereo_sfm.pipeline.watchdog import STOPPED, process_state
@@ -229,6 +229,8 @@ def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests:
     """Body of the process: joins the session's part on request; a thread that mostly rests looks for its loops."""
     end_with_service()
     raise_priority("mapper")
+    return_large_blocks()
+    share_one_heap()
     try:
         growing = GrowingMap(load_map(base), configured_vocabulary(config.loop), config)
     except (StereoSfmError, OSError) as error:
