@@ -9,7 +9,8 @@ from pathlib import Path
 from _sequences import data_root
 
 FOLDER = "STEREO_SFM_REAL"  # environment variable: the sequences that are laid out from public repositories
-CHANGED = "backwards", "mirrored", "upside down"  # what `benchmarks changed` makes of pairs
+# What `benchmarks changed` makes of pairs:
+CHANGED = "backwards", "mirrored", "upside down", "half the rate", "half the size"
 BONN_STARTS_S = (0.0, 1.0, 2.0, 7.0, 7.8, 9.0, 10.0, 12.0, 14.0, 15.5, 16.0, 16.5, 18.0, 20.0, 22.0, 23.0)
 
 

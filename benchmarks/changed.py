@@ -1,4 +1,4 @@
-"""Real sequences backwards, mirrored and upside down: real images that nobody has looked at.
+"""Real sequences backwards, mirrored, upside down, at half the rate and half the size: images nobody has looked at.
 
     STEREO_SFM_REAL=FOLDER STEREO_SFM_DATA=FOLDER python -m benchmarks changed -- [--only NAME]
 
@@ -23,7 +23,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.export.trajectories import write_tum
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.types import F64, Trajectory
+from stereo_sfm.types import F64, U8, Trajectory
 
 
 def flipped(camera: Camera, upside_down: bool) -> Camera:
@@ -36,6 +36,20 @@ def flipped(camera: Camera, upside_down: bool) -> Camera:
         cy=camera.height - 1 - camera.cy if upside_down else camera.cy,
         distortion=tuple(d * sign for d, sign in zip(camera.distortion, signs, strict=False)),
     )
+
+
+def halved(camera: Camera) -> Camera:
+    """A camera whose pixels are as large as two by two of these; an odd last row or column is left out."""
+    cx, cy = ((c + 0.5) / 2 - 0.5 for c in (camera.cx, camera.cy))
+    size = {"width": camera.width // 2, "height": camera.height // 2}
+    return replace(camera, **size, fx=camera.fx / 2, fy=camera.fy / 2, cx=cx, cy=cy)
+
+
+def halved_image(image: U8) -> U8:
+    """Means of two by two pixels."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    half = cv2.resize(image[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(half, np.uint8)
 
 
 def flip(upside_down: bool) -> F64:
@@ -65,7 +79,7 @@ def write(sequence: Sequence, place: Path, out: Path, how: str) -> None:
     axes = {"mirrored": 1, "upside down": -1}  # of cv2.flip
     with open_source(str(place), place.parent / sequence.rig if sequence.rig else None) as source:
         rig, truth = source.rig, source.ground_truth
-        images = [image for image in source if image.right is not None]
+        images = [image for image in source if image.right is not None][:: 2 if how == "half the rate" else 1]
     first_ns, last_ns = images[0].stamp_ns, images[-1].stamp_ns
     for side in ("left", "right"):
         (out / side).mkdir(parents=True)
@@ -73,20 +87,27 @@ def write(sequence: Sequence, place: Path, out: Path, how: str) -> None:
     for k, image in enumerate(images[::-1] if how == "backwards" else images):
         pair = [image.left, np.asarray(image.right)]
         if how in axes:
-            pair = [np.asarray(cv2.flip(side, axes[how])) for side in pair[::-1]]
+            pair = [np.asarray(cv2.flip(side, axes[how]), np.uint8) for side in pair[::-1]]
+        if how == "half the size":
+            pair = [halved_image(pixels) for pixels in pair]
         for side, pixels in zip(("left", "right"), pair, strict=True):
             cv2.imwrite(str(out / side / f"{k:06d}.png"), pixels)
         times.append(last_ns - image.stamp_ns if how == "backwards" else image.stamp_ns - first_ns)
     np.savetxt(out / "times.txt", np.array(times) * 1e-9, fmt="%.9f")
-    same = Rig(rig.left, rig.right, rig.left_T_right, name=rig.name)
-    write_native(flipped_rig(rig, how == "upside down") if how in axes else same, out / "rig.yaml")
+    if how in axes:
+        changed = flipped_rig(rig, how == "upside down")
+    else:
+        assert rig.right is not None
+        left, right = (halved(c) if how == "half the size" else c for c in (rig.left, rig.right))
+        changed = Rig(left, right, rig.left_T_right, name=rig.name)
+    write_native(changed, out / "rig.yaml")
     if truth is None:
         return
     if how == "backwards":
         truth = Trajectory((last_ns - truth.stamp_ns)[::-1].copy(), truth.poses[::-1].copy())
     else:
         truth = Trajectory(truth.stamp_ns - first_ns, truth.poses)
-        truth = flipped_truth(truth, rig, how == "upside down")
+        truth = flipped_truth(truth, rig, how == "upside down") if how in axes else truth
     write_tum(out / "groundtruth.tum", truth)
 
 

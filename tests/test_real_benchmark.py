@@ -166,3 +166,18 @@ def test_a_flipped_rig_sees_the_flipped_images(modules: dict[str, ModuleType], u
     world = points @ truth.poses[0, :3, :3].T + truth.poses[0, :3, 3]
     seen = in_new @ new.poses[0, :3, :3].T + new.poses[0, :3, 3]
     assert seen == pytest.approx(world if upside_down else world @ turn, abs=1e-9)
+
+
+def test_a_halved_camera_sees_the_halved_image(modules: dict[str, ModuleType]) -> None:
+    """A spot of light of odd images lies where the halved camera projects it."""
+    lens = RadTan(201, 121, 150.0, 151.0, 99.0, 62.0, (-0.2, 0.05, 2e-3, -1e-3))
+    point = np.array([0.21, -0.17, 1.3])
+    at = lens.project(point)
+    v, u = np.mgrid[: lens.height, : lens.width]
+    spot = 250 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 18.0)
+    half = modules["changed"].halved_image(spot.astype(np.uint8)).astype(float)
+    camera = modules["changed"].halved(lens)
+    assert half.shape == (camera.height, camera.width) == (60, 100)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    centre = np.array([(u * half).sum(), (v * half).sum()]) / half.sum()
+    assert camera.project(point) == pytest.approx(centre, abs=0.02)
