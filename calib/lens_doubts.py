@@ -20,6 +20,7 @@ log = logging.getLogger("stereo_sfm")
 MOST_TILTED_DEG = 2.0
 NEAREST_M = 1.0  # a stereo camera for a robot or a car shows half of its view to both cameras at this distance
 LEAST_FAR_M = 1.0  # and can tell this distance from infinity, by a pixel
+USUAL_M = 0.015, 0.6  # baselines: of cameras for the near (RealSense D405: 18 mm) and of pairs on cars (KITTI: 540 mm)
 MOST_SCALE = 1.6  # of one image by the other: rendered pairs are matched from 0.6 to 1.25, not at 0.5 and 2
 
 
@@ -71,6 +72,9 @@ def length_doubts(rig: Rig) -> list[str]:
         found.append(f"{millimetres} lenses whose views overlap by half only from {nearest:.1f} m on: {remedy}")
     if reach < LEAST_FAR_M:
         found.append(f"{millimetres} lenses that then see depth up to {reach:.2g} m: {remedy}")
+    least, most = USUAL_M
+    if not (found or least <= rig.baseline <= most):
+        found.append(f"{millimetres} a stereo camera ({1e3 * least:g} to {1e3 * most:g} mm are usual): {remedy}")
     if rig.left_T_right[0, 3] < -0.5 * rig.baseline:
         found.append("the right camera is to the left of the left one: are the two exchanged, or the sign of Tx?")
     return found

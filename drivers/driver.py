@@ -96,3 +96,8 @@ class Driver(Generic[O]):
     check: Callable[[str, O], None] = _nothing
     recognise: Callable[[Path], Certainty] = _not_mine
     cameras: Cameras | None = None
+
+    @property
+    def of_files(self) -> bool:
+        """Whether its sources are files or folders."""
+        return self.recognise is not _not_mine

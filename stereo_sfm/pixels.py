@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import warnings
+import zlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,6 +19,7 @@ from stereo_sfm.types import U8, U16
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")  # of image files
 MAX_PIXELS = 10**8  # of one image, more than any camera of a rig has
+PNG = b"\x89PNG\r\n\x1a\n"  # how such a file begins
 DARK = 30  # grey level; an image without a brighter pixel is dark
 LEFT_ALIGNED = 0xF  # bits that are always zero when a sensor of at most twelve bits fills the upper part of sixteen
 
@@ -50,9 +52,22 @@ def cut_off(data: bytes) -> bool:
     A PNG ends with the chunk IEND. A JPEG has an end marker after its last start of a scan; both are
     unambiguous, as a scan's own bytes of 255 are followed by zero.
     """
-    if data.startswith(b"\x89PNG"):
+    if data.startswith(PNG):
         return b"IEND" not in data
     return data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda")
+
+
+def _damaged_png(data: bytes) -> bool:
+    """Whether a checksum of its chunks is wrong: libpng would print lines of its own about that."""
+    view, at = memoryview(data), len(PNG)
+    while at + 12 <= len(data):
+        end = at + 12 + int.from_bytes(view[at : at + 4])
+        if end > len(data) or zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(view[end - 4 : end]):
+            return True
+        if data[at + 4 : at + 8] == b"IEND":
+            return False
+        at = end
+    return True
 
 
 def decode(data: bytes, flags: int) -> np.ndarray[Any, Any]:
@@ -64,6 +79,8 @@ def decode(data: bytes, flags: int) -> np.ndarray[Any, Any]:
     declared_size(data)
     if cut_off(data):
         raise ValueError("a compressed image is cut off")
+    if data.startswith(PNG) and _damaged_png(data):
+        raise ValueError("a compressed image is damaged")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):

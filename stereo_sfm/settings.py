@@ -7,6 +7,7 @@ Names carry their unit as the suffix `_px`, `_m`, `_s`, `_deg`, `_bits`; a stand
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import field
 from operator import attrgetter
@@ -65,9 +66,12 @@ def check(tree: Any) -> None:
             raise StereoSfmError(
                 f"configuration: {name} is '{value}'{did_you_mean(value, words)}: choose one of {', '.join(words)}"
             )
-        if "range" in f.metadata and not f.metadata["range"][0] <= value <= f.metadata["range"][1]:
-            least, most = f.metadata["range"]
-            raise StereoSfmError(f"configuration: {name} is {plain(value)}: it must be from {least:g} to {most:g}")
+        if "range" not in f.metadata:
+            continue
+        least, most = f.metadata["range"]
+        if isinstance(value, bool) or not least <= value <= most:  # Python takes True for 1
+            shown = plain(value)[:80]
+            raise StereoSfmError(f"configuration: {name} is {shown}: it must be from {least:g} to {most:g}")
 
 
 def plain(value: float) -> str:
@@ -111,7 +115,12 @@ def read(tree: T, data: dict[str, Any], see: str) -> T:
 
 
 def _as_float(value: Any) -> Any:
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+    if not isinstance(value, int) or isinstance(value, bool):
+        return value
+    try:
+        return float(value)
+    except OverflowError:  # more than 300 digits
+        return math.inf if value > 0 else -math.inf
 
 
 def check_names(tree: Any, data: dict[str, Any], see: str, place: str = "") -> None:

@@ -45,6 +45,11 @@ from stereo_sfm.settings import walk
         ("treker.max_features=3", "there is no treker, did you mean tracker?"),
         ("tracker=3", "tracker is a section of settings, as tracker.max_features"),
         ("tracker.max_features=many", "tracker.max_features"),
+        ("tracker.max_features=true", "tracker.max_features is True: it must be from 1 to 20000"),  # Python: 1
+        ("tracker.sigma_px=true", "tracker.sigma_px is True"),
+        (f"tracker.sigma_px={'9' * 400}", "tracker.sigma_px is inf"),
+        (f"tracker.sigma_px=-{'9' * 400}", "tracker.sigma_px is -inf"),
+        (f"tracker.max_features={'9' * 400}", "it must be from 1 to 20000"),
     ],
 )
 def test_invalid_values_of_settings_are_rejected(override: str, message: str) -> None:

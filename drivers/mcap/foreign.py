@@ -52,7 +52,8 @@ class ForeignSource(BaseSource):
         self._joints = [name for name in options.joints.split(",") if name]
         self._unreadable = 0  # images of the last reading
         self._read_forward()
-        first = next((message_of(record, self.name) for record in reader.messages([self.topics.left])), None)
+        left = reader.messages([self.topics.left])
+        first = next((found for record in left if (found := message_of(record, self.name)) is not None), None)
         self._video = first.encoding if first and first.video else ""
         clock = self._found_clock()
         self.topics = on_the_clock(reader, self.topics, clock)

@@ -10,8 +10,8 @@ token = Path(sys.argv[2]) if len(sys.argv) > 2 else Path.home() / ".local/state/
 connection = socket.socket(socket.AF_INET if place.isdigit() else socket.AF_UNIX)
 try:
     connection.connect(("127.0.0.1", int(place)) if place.isdigit() else place)
-except OSError as error:
-    sys.exit(f"no service at {place}: {error.strerror}")
+except (OSError, OverflowError) as error:
+    sys.exit(f"no service at {place}: {getattr(error, 'strerror', error)}")
 try:
     if token.exists():
         connection.sendall(token.read_bytes())

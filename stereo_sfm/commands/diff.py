@@ -29,12 +29,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print "identical" and return 0, or what differs and 3."""
+    for path in (args.a, args.b):
+        if not path.exists():
+            raise StereoSfmError(f"no such file or folder: {path}")
     if args.a.is_dir() != args.b.is_dir():
-        raise StereoSfmError("diff: give two folders of runs, or two logs")
+        raise StereoSfmError("give two folders of runs, or two logs")
     if args.a.is_dir() and not (args.topics or args.all):
         return _runs([args.a, args.b], args.output)
     if args.output is not None:
-        raise StereoSfmError("diff: --output is for two folders of runs, without --topics and --all")
+        raise StereoSfmError("--output is for two folders of runs, without --topics and --all")
     paths = [path / "run.mcap" if path.is_dir() else path for path in (args.a, args.b)]
     return _logs(paths[0], paths[1], list(args.topics), float(args.tol), bool(args.all))
 

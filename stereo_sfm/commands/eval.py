@@ -138,6 +138,8 @@ def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, T
 
 def estimate_file(path: Path, which: str | None) -> Path:
     """The trajectory of a run's folder, or the file itself."""
+    if not path.exists():
+        raise StereoSfmError(f"no trajectory at {path}")
     if not path.is_dir():
         return path
     names = [f"trajectory_{which}.tum"] if which in ("odom", "map") else ["trajectory_map.tum", "trajectory_odom.tum"]

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Describe and return 0, also when problems are found and printed."""
-    from stereo_sfm.drivers.registry import recognise
+    from stereo_sfm.drivers.registry import driver, recognise
     from stereo_sfm.drivers.source import look_up, path_of
     from stereo_sfm.recording.describe import describe_dataset, describe_file
     from stereo_sfm.storage.remote import Remote, is_uri, place
@@ -39,7 +39,12 @@ def run(args: argparse.Namespace) -> int:
     path = path_of(args.source)
     if not path.exists():
         look_up(args.source, args.rig)  # the driver's own check knows more
+        kind, colon, _ = args.source.partition(":")
+        if colon and not driver(kind).of_files:
+            raise StereoSfmError(f"{args.source} is no recording: 'stereo-sfm sources {kind}' describes it")
         raise StereoSfmError(f"no such file or folder: {path}")
+    if (path / "run.mcap").is_file():
+        path /= "run.mcap"
     in_one_file = path.is_file() and recognise(path) == "mcap"
     found = describe_file(path, args.rig) if in_one_file else describe_dataset(args.source, args.rig)
     print(found.as_json() if args.json else "\n".join(_lines(found)))

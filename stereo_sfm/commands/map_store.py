@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -103,14 +104,19 @@ def run(args: argparse.Namespace) -> int:
 def _update(store: Path, walks: list[str], config: Config, keep: int) -> int:
     """One version for each session."""
     from stereo_sfm.maps.put_session import put_session
-    from stereo_sfm.maps.store import lock
+    from stereo_sfm.maps.store import lock, versions_folder
 
-    with lock(store):
-        for name in walks:
-            put = put_session(store, mapped(name, config), name, config, keep)
-            # "STORE: begun with NAME", "STORE version 3: NAME, ..."
-            print(f"{store}{':' if put.text.startswith('begun') else ''} {put.text}")
-            print("".join(f"  {line}\n" for line in put.changes), end="")
+    try:
+        with lock(store):
+            for name in walks:
+                put = put_session(store, mapped(name, config), name, config, keep)
+                # "STORE: begun with NAME", "STORE version 3: NAME, ..."
+                print(f"{store}{':' if put.text.startswith('begun') else ''} {put.text}")
+                print("".join(f"  {line}\n" for line in put.changes), end="")
+    finally:
+        if not store.exists():
+            with contextlib.suppress(OSError):  # it is not empty
+                versions_folder(store).rmdir()
     return 0
 
 

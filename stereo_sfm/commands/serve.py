@@ -16,6 +16,7 @@ OTHERS = 0o027  # images show people: files that the service writes are not for 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("source", nargs="?", metavar="SOURCE", help="instead of robot.toml's: as `run` takes it")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration to use instead of the source's own")
     parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="robot.toml")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="set one value, as in source.spec=t265:"
@@ -43,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     socket = "outputs.pose_socket"
     poses = [f"{socket}.enabled=true", override(f"{socket}.address", args.pose_socket)] if args.pose_socket else []
     source = [override("source.spec", args.source)] if args.source else []
+    source += [override("source.rig", str(args.rig.resolve()))] if args.rig else []
     config = load(args.config, [*source, *args.set, *poses])
     if args.print_ports:
         from stereo_sfm.service.outputs.ports import ports

@@ -107,9 +107,18 @@ def differences(runs: Sequence[ComparedRun]) -> list[list[str]]:
         "lost intervals": lambda stats: str(len(stats["lost_intervals"])),
         "dropped": lambda stats: str(stats["dropped"]),
         "submaps": lambda stats: str(stats["pieces"]),
-        "corrections": lambda stats: "; ".join(c["text"] for c in stats["calibration"]) or "none",
+        "corrections": lambda stats: "; ".join(_corrections(stats)) or "none",
     }
-    return rows + [[name, *(read(run.stats) for run in runs)] for name, read in more.items()]
+    rows += [[name, *(read(run.stats) for run in runs)] for name, read in more.items()]
+    against = "ground truth" if reference is not None else runs[0].name
+    return [*rows, ["errors are against", against, against]]
+
+
+def _corrections(stats: dict[str, Any]) -> list[str]:
+    """Of the calibration, at the start and by self-calibration."""
+    at_start = stats.get("start_check")
+    first = [f"at the start: {at_start['text']}"] if at_start and at_start["corrected"] else []
+    return [*first, *(c["text"] for c in stats["calibration"])]
 
 
 def changed_settings(folders: Sequence[Path]) -> list[list[str]]:

@@ -40,7 +40,7 @@ REJECTIONS = {
 }
 FEW_INLIERS = 60  # median points per frame below which the pose is poorly constrained
 MIN_LENGTH_M = 1.0  # shortest path whose length is compared
-BIG_SCALE_ERROR = 0.02  # Sim(3) scale error above which the baseline is suspected
+BIG_ERROR = 0.02  # of the path's length: of a scale above it the baseline is suspected
 
 
 def write_report(
@@ -71,7 +71,6 @@ def write_report(
     lines += ["![trajectory](trajectory.png)", ""] if "trajectory" in drawings else []
     lines += ["## Verdict", "", *(f"* {verdict}" for verdict in judged), ""]
     lines += ["## Summary", "", f"* source: {source_name}", *(f"* {line}" for line in summary(stats, evaluations))]
-    lines += _warnings(stats)
     for name, result in evaluations.items():
         lines += ["", f"## {name.capitalize()} against ground truth", "", "| | |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in table(result)]
@@ -174,11 +173,10 @@ def _plots_by_name(
     return drawings
 
 
-def _warnings(stats: dict[str, Any]) -> list[str]:
+def _odd(stats: dict[str, Any]) -> list[str]:
     """What was odd about the source and left out or mended, except what the summary says."""
     said = stats["start_check"]["text"] if stats["start_check"] else None
-    lines = [line for line in stats["warnings"] if said is None or said not in line]
-    return ["", "## Warnings", "", *(f"* {line}" for line in lines)] if lines else []
+    return [f"**WARN**: {line}" for line in stats["warnings"] if said is None or said not in line]
 
 
 def _drops(stats: dict[str, Any]) -> list[str]:
@@ -221,16 +219,21 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
         rows = stats["row_errors"]["systematic_px"]
         out.append(f"**WARN**: the calibration does not fit the images (row error {rows:.2f} px): see check-calib")
     if stats["pieces"] <= 1:  # else the submaps' relative poses are wrong, not the lengths
-        out += [text for name, result in evaluations.items() if (text := _length(name, result))]
+        out += [text for name, result in evaluations.items() if (text := _error(name, result))]
+    out += _odd(stats)
     if not out and stats["tracked"]:
         out.append(passed(stats))
     return out or ["no frames"]
 
 
-def _length(name: str, result: Evaluation) -> str:
-    """Whether a path is too long or too short; "" if it is too short to decide or has no scale."""
-    off = 1 / result.sim3_scale - 1
-    if result.mode == "sim3" or result.length_m < MIN_LENGTH_M or not abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
+def _error(name: str, result: Evaluation) -> str:
+    """Whether a path is too long, too short or far from the true one; "" if it is very short or has no scale."""
+    if result.mode == "sim3" or result.length_m < MIN_LENGTH_M:
         return ""
-    how = "long" if off > 0 else "short"
-    return f"**WARN**: {name} is {abs(100 * off):.1f} % too {how}: check the baseline and the calibration"
+    off = 1 / result.sim3_scale - 1
+    if abs(result.sim3_scale - 1) > BIG_ERROR:
+        how = "long" if off > 0 else "short"
+        return f"**WARN**: {name} is {abs(100 * off):.1f} % too {how}: check the baseline and the calibration"
+    if result.ate_percent > 100 * BIG_ERROR:
+        return f"**WARN**: {name} is off by {result.ate_percent:.2g} % of the path: see the picture for where"
+    return ""

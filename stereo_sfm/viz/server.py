@@ -7,11 +7,9 @@ the user asks for another address.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib.util
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import time
@@ -20,13 +18,13 @@ from typing import Any
 from urllib.parse import quote
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pipeline.child import end_with_parent
 
 LOOPBACK = "127.0.0.1"
 EVERYWHERE = ("0.0.0.0", "::")
 WEB_PORT, GRPC_PORT = 9090, 9876
 MEMORY_LIMIT = "1GB"  # of the viewer's history
 START_S = 20.0  # time for a viewer to start listening
-PR_SET_PDEATHSIG = 1
 
 
 def serve(address: str) -> tuple[str, str]:
@@ -44,7 +42,7 @@ def serve(address: str) -> tuple[str, str]:
     _check_free(address, GRPC_PORT, WEB_PORT)
     ports = ("--port", str(GRPC_PORT), "--web-viewer-port", str(WEB_PORT))
     options = ("--serve-web", "--bind", address, *ports, "--server-memory-limit", MEMORY_LIMIT)
-    process = subprocess.Popen([_executable(), *options], **_SILENT, preexec_fn=_end_with_parent)
+    process = subprocess.Popen([_executable(), *options], **_SILENT, preexec_fn=end_with_parent)
     here = LOOPBACK if address in EVERYWHERE else address
     _wait_for(process, here, GRPC_PORT, WEB_PORT)
     host = socket.gethostname() if address in EVERYWHERE else address
@@ -78,12 +76,6 @@ def _executable() -> str:
     if viewer is None:
         raise StereoSfmError("cannot open the viewer: there is no 'rerun' (pip install rerun-sdk)")
     return viewer
-
-
-def _end_with_parent() -> None:
-    """In the child: exit with the parent process, however that ends (Linux)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _wait_for(process: subprocess.Popen[Any], address: str, *ports: int) -> None:

@@ -46,6 +46,8 @@ def test_baselines_in_other_units_are_doubted() -> None:
         assert "overlap by half only from" in doubts(far(rig, 100))[0]  # centimetres
         assert "is unusual" in doubts(far(rig, 1 / 0.025))[0]  # squares of 25 mm
         assert "is unusual" in doubts(far(rig, 1e-2))[0]
+        assert "is unusual" in doubts(far(rig, 10))[0]
+        assert "is unusual" in doubts(far(rig, 0.1))[0]
     kitti = Pinhole(1241, 376, 718.856, 718.856, 607.2, 185.2)
     transform = np.eye(4)
     transform[0, 3] = 0.537

@@ -65,6 +65,18 @@ def test_a_mistyped_folder_is_no_camera(cli: Run, tmp_path: Path) -> None:
     assert_one_line(cli("run", "ros3x4"), "no such file or folder: ros3x4 (")
 
 
+def test_runs_that_are_not_there(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "run1").mkdir()
+    assert_one_line(cli("eval", "runX"), "no trajectory at runX")
+    assert_one_line(cli("diff", "runX", "run1"), "no such file or folder: runX")
+    assert_one_line(cli("map", "update", "storX", "run9"), "no such file or folder: run9")
+    assert [path.name for path in tmp_path.iterdir()] == ["run1"]
+
+
+def test_a_simulated_camera_is_no_recording(cli: Run) -> None:
+    assert_one_line(cli("info", "sim:loop"), "sim:loop is no recording: 'stereo-sfm sources sim' describes it")
+
+
 def test_a_folder_named_like_a_kind_is_the_folder(cli: Run, tmp_path: Path) -> None:
     (tmp_path / "euroc").mkdir()
     assert_one_line(cli("info", "euroc"), "euroc is not a known kind of dataset")

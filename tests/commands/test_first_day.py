@@ -105,6 +105,18 @@ def test_info_finds_damaged_images(
     assert "problem: 1 of 9 sampled frames cannot be read" in out and "no problems found" not in out
 
 
+def test_a_damaged_png_is_told_in_our_words(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """OpenCV's library prints lines of its own."""
+    place = copy_of(folder, tmp_path / "flipped")
+    path = sorted((place / "left").iterdir())[4]
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(data)
+    assert main(["info", f"images:{place}"]) == 0
+    said = capfd.readouterr()
+    assert "problem: 1 of 9 sampled frames cannot be read" in said.out and "libpng" not in said.out + said.err
+
+
 def test_info_lists_what_readers_warn_about(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,22 +9,29 @@ import time
 import xml.etree.ElementTree as ElementTree
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from stereo_sfm import timing
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import SourceChoice
-from stereo_sfm.eval.compare import names_of
+from stereo_sfm.eval import plots
+from stereo_sfm.eval.compare import ComparedRun, differences, names_of
+from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.headline import headline
 from stereo_sfm.eval.html_page import take_plots, to_html
 from stereo_sfm.eval.report import verdicts
 from stereo_sfm.eval.tables import write_table
+from stereo_sfm.geometry import se3
 from stereo_sfm.kernel_cache import Compilation
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.pipeline.session import Session, Wiring
+from stereo_sfm.types import Trajectory
 
 
 @pytest.fixture(scope="module")
@@ -66,18 +73,65 @@ def test_a_report_begins_with_one_sentence_and_the_picture(runs: tuple[Path, Pat
     assert "| latency |" not in "".join(blocks)  # a recording is read ahead
 
 
-def test_pass_is_more_than_poses(runs: tuple[Path, Path]) -> None:
+@pytest.fixture(scope="module")
+def good(runs: tuple[Path, Path]) -> dict[str, Any]:
+    """The numbers of a run without a warning."""
     stats = json.loads((runs[0] / "stats.json").read_text("utf-8"))
-    good = {**stats, "tracked": stats["frames"], "lost_percent": 0.0, "lost_intervals": [], "inliers_median": 200.0,
-            "pieces": 1, "start_check": None, "sensors": {}}  # fmt: skip
-    good["row_errors"] = {**stats["row_errors"], "warning": ""}
+    return {**stats, "tracked": stats["frames"], "lost_percent": 0.0, "lost_intervals": [], "inliers_median": 200.0,
+            "pieces": 1, "start_check": None, "sensors": {}, "warnings": [],
+            "row_errors": {**stats["row_errors"], "warning": ""}}  # fmt: skip
+
+
+def test_pass_is_more_than_poses(good: dict[str, Any]) -> None:
     (line,) = verdicts(good, {})
     assert line.startswith("**PASS**") and "200 points" in line and "row error" in line
     assert "is known for all 15 images" in headline(good, {}, 0) and "no true path" in headline(good, {}, 0)
     for fault in ({"inliers_median": 20.0}, {"pieces": 2}, {"row_errors": {**good["row_errors"], "warning": "x"}}):
         lines = verdicts({**good, **fault}, {})
         assert len(lines) == 1 and lines[0].startswith("**WARN**")
+    odd = verdicts({**good, "warnings": ["a message cannot be read", "no IMU"]}, {})
+    assert odd == ["**WARN**: a message cannot be read", "**WARN**: no IMU"]
     assert headline({**good, "tracked": 0}, {}, 0) == "**This run failed**: tracking never initialised."
+
+
+def test_a_path_far_from_the_true_one_is_no_pass(good: dict[str, Any]) -> None:
+    """Also where its length is right: it is bent."""
+    stamps = np.arange(200) * 50_000_000
+    true = np.tile(np.eye(4), (200, 1, 1))
+    true[:, 0, 3] = np.linspace(0, 20, 200)
+    true[:, 1, 3] = np.cos(np.linspace(0, np.pi, 200))
+    bent = true.copy()
+    bent[:, 2, 3] = 0.9 * np.sin(np.linspace(0, 3 * np.pi, 200))
+    found = evaluate(Trajectory(stamps, bent), Trajectory(stamps, true))
+    assert abs(found.sim3_scale - 1) < 0.02 and found.ate_percent > 2
+    same = evaluate(Trajectory(stamps, true), Trajectory(stamps, true))
+    assert verdicts(good, {"map": same})[0].startswith("**PASS**")
+    (line,) = verdicts(good, {"map": found})
+    assert line.startswith("**WARN**: map is off by") and "of the path" in line
+
+
+def test_what_two_runs_differ_in_has_corrections_at_the_start(good: dict[str, Any]) -> None:
+    """And says what the errors are against, where there is no ground truth."""
+    path = Trajectory(np.arange(9) * 50_000_000, se3.exp(np.linspace(0, 1, 9)[:, None] * np.ones(6)))
+    corrected = {**good, "start_check": {"text": "turned by 1.6 degrees", "shown": True, "corrected": True}}
+    rows = {
+        row[0]: row[1:]
+        for row in differences([ComparedRun("a", corrected, path, None), ComparedRun("b", good, path, None)])
+    }
+    assert rows["corrections"] == ["at the start: turned by 1.6 degrees", "none"]
+    assert rows["errors are against"] == ["a", "a"]
+
+
+def test_the_plot_of_times_shows_what_it_draws(runs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compiling is in the age of a pose, which it leaves out."""
+    stages, drawn = {"track": 5.0, "map": 2.0}, list[Figure]()
+    record = SimpleNamespace(
+        frames=SimpleNamespace(stamp_ns=np.arange(9) * 1_000_000_000),
+        times=lambda: {**{name: np.full(9, ms) for name, ms in stages.items()}, "latency": np.full(9, 2e4)},
+    )
+    monkeypatch.setattr(plots, "_save", lambda figure, path: drawn.append(figure))
+    plots.plot_times(Path("times.png"), record, list(stages))  # pyright: ignore[reportArgumentType]
+    assert drawn[0].axes[0].get_ylim()[1] == pytest.approx(6.0)
 
 
 def test_compiling_is_no_time_of_a_stage(monkeypatch: pytest.MonkeyPatch) -> None:

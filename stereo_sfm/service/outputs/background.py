@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pipeline.child import end_with_parent
 
 NICE = 10
 
@@ -20,11 +21,14 @@ def run_command(arguments: Sequence[str], timeout_s: float) -> str:
     """
     command = [sys.executable, "-m", "stereo_sfm.cli", *arguments]
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=lambda: os.nice(NICE)
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=_below)
     except subprocess.TimeoutExpired:
         raise StereoSfmError(f"stereo-sfm {arguments[0]} took longer than {timeout_s:.0f} s") from None
     if done.returncode:
         raise StereoSfmError(" ".join(done.stderr.split())[-200:])
     return done.stdout
+
+
+def _below() -> None:
+    os.nice(NICE)
+    end_with_parent()
