@@ -16,6 +16,7 @@ from stereo_sfm.types import F64, Bool, ReadOnly
 BASELINE_RANGE_M = 1e-4, 10.0
 MAX_SKEW = 1e-4  # of a rotation: largest deviation of its product with its transpose from the identity
 MAX_PIXELS = 10**8
+MAX_FOCAL = 100  # of the larger side of the image: of telescopes
 MAX_READOUT_S = 0.2
 SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
 MAX_DISTORTION = 1e6  # rational models of real lenses have some hundred
@@ -147,7 +148,8 @@ def _check_camera(side: str, camera: Camera) -> None:
     wrong = [f"{name} {value:g}" for name, value in numbers.items() if not np.isfinite(value)]
     wrong += [f"distortion {value:g}" for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
     wrong += [camera.impossible()] if not wrong and camera.impossible() else []
-    wrong += [f"{name} {numbers[name]:g}" for name in ("fx", "fy") if numbers[name] <= 0]
+    most = MAX_FOCAL * max(camera.width, camera.height)
+    wrong += [f"{name} {numbers[name]:g}" for name in ("fx", "fy") if not 0 < numbers[name] <= most]
     wrong += [f"cx {camera.cx:g}"] if abs(camera.cx) > 2 * camera.width else []
     wrong += [f"cy {camera.cy:g}"] if abs(camera.cy) > 2 * camera.height else []
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MAX_PIXELS:

@@ -14,6 +14,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
+from stereo_sfm.drivers.text_file import nanoseconds
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
@@ -98,6 +99,7 @@ class FolderSource(BaseSource):
         """
         if not frames:
             raise StereoSfmError(f"{name}: its list names no images")
+        nanoseconds([s for frame in frames for s in (frame.stamp_ns, frame.right_stamp_ns)], name)
         self.name = name
         self.rig = rig
         self.ground_truth = ground_truth

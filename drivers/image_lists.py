@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.drivers.ground_truth import stamp_from_seconds
-from stereo_sfm.drivers.text_file import LAST_NS
+from stereo_sfm.drivers.text_file import LAST_NS, nanoseconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import SUFFIXES
 
@@ -169,7 +169,7 @@ def pair_listings(name: str, left: Listing, right: Listing) -> list[tuple[int, i
 
 def _median_distance(left: Sequence[int], right: Sequence[int]) -> float:
     """Median distance from a left stamp to the nearest right one, nanoseconds."""
-    a, b = np.asarray(left, np.int64), np.sort(np.asarray(right, np.int64))
+    a, b = nanoseconds(left, "the images"), np.sort(nanoseconds(right, "the images"))
     after = np.clip(np.searchsorted(b, a), 0, len(b) - 1)
     return float(np.median(np.minimum(np.abs(b[after] - a), np.abs(b[np.maximum(after - 1, 0)] - a))))
 
@@ -222,7 +222,7 @@ def pair_by_stamp(a: Sequence[int], b: Sequence[int], max_difference_ns: int) ->
     """Indices (i, j) of the pairs whose stamps differ least; each entry is used once, smallest differences first."""
     if not a or not b:
         return []
-    stamps_a, stamps_b = np.asarray(a, np.int64), np.asarray(b, np.int64)
+    stamps_a, stamps_b = nanoseconds(a, "the images"), nanoseconds(b, "the images")
     order = np.argsort(stamps_b, kind="stable")
     right_of = np.searchsorted(stamps_b[order], stamps_a)
     candidates: list[tuple[int, int, int]] = []

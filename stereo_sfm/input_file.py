@@ -25,6 +25,24 @@ MOST_VALUES = 1_000_000  # of YAML, with every alias written out
 MOST_CHARS = 1 << 16  # of one value of YAML
 
 
+def with_plain_numbers(tree: Any) -> Any:
+    """Nested values whose whole numbers have 64 bits at most, as everything here has them.
+
+    Raises:
+        ValueError: one has more.
+    """
+    waiting = [tree]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += [*value, *value.values()]
+        elif isinstance(value, list):
+            waiting += value
+        elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
+            raise ValueError(f"a whole number of {value.bit_length()} bits is too large")
+    return tree
+
+
 class NotAFile(StereoSfmError, OSError):
     """A pipe, a device, a folder, or a file too large for what it should be.
 
@@ -93,7 +111,7 @@ def read_json(path: Path, most: int = MOST_JSON) -> Any:
         OSError: it cannot be read. ValueError: it is not JSON, or nested too deeply.
     """
     try:
-        return json.loads(read_text(path, most))
+        return with_plain_numbers(json.loads(read_text(path, most)))
     except RecursionError:
         raise ValueError("nested too deeply") from None
 
@@ -113,9 +131,12 @@ def read_yaml(path: Path, most: int = MOST_YAML) -> Any:
     text = read_text(path, most)
     count_values(text)
     try:
-        return yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))  # not every build has the fast one
+        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # not every build has the fast one
+        return with_plain_numbers(yaml.load(text, loader))
     except yaml.YAMLError as error:
         raise ValueError(_said(error)) from None
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:  # a tag whose value is none of its kind
+        raise ValueError(f"a value is not what its tag says ({error})") from None
 
 
 def count_values(text: str, before: int = 0) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from stereo_sfm import input_file
@@ -17,6 +18,7 @@ from stereo_sfm.calib.mask import read_mask
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.folder_source import UnreadableImage, read_gray
 from stereo_sfm.drivers.ground_truth import read_trajectory
+from stereo_sfm.drivers.text_file import nanoseconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.compare import stats_of
 from stereo_sfm.input_file import NotAFile, count_values, read_bytes, read_json, read_yaml
@@ -127,6 +129,21 @@ def test_json_that_is_nested_too_deeply(tmp_path: Path) -> None:
         read_json(tmp_path / "a.json")
 
 
+def test_whole_numbers_that_no_array_holds(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_text(f'{{"a": [{"9" * 400}]}}')
+    with pytest.raises(ValueError, match="too large"):
+        read_json(path)
+    path.write_text('{"a": -9223372036854775808, "b": true}')
+    assert read_json(path) == {"a": -(2**63), "b": True}
+
+
+def test_stamps_that_no_clock_can_tell() -> None:
+    assert nanoseconds([1, 2**63 - 1], "a").dtype == np.int64
+    with pytest.raises(StereoSfmError, match=r"a: a stamp of 9.22337e[+]09 s is later than the year 2262"):
+        nanoseconds([1, 2**63], "a")
+
+
 def test_values_of_yaml_are_counted_before_they_are_made(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_text("a: &a [1, 2]\nb: {<<: {c: 3}, d: [*a, *a]}\n")
@@ -155,6 +172,12 @@ def _doubled(form: str) -> str:
         ("a: [1, 2\nb: 3", r"not YAML \(line 2\)"),
         ("a: !!python/object:os.system {}", "not YAML"),
         ("{[1]: 2}: 3", "not YAML"),
+        (f"a: {'9' * 400}", "too large"),
+        (f"a: [{{b: -0x{'f' * 40}}}]", "too large"),
+        (f"{'9' * 30}: 1", "too large"),
+        ("height: 9223372036854775808", "too large"),
+        ("a: !!timestamp x", "not what its tag says"),
+        ('a: !!int ""', "not what its tag says"),
     ],
 )
 def test_yaml_that_no_parser_should_see(text: str, says: str, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from stereo_sfm.drivers.text_file import nanoseconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import I64
 
@@ -51,7 +52,8 @@ def clock_of(name: str, topics: list[str], stamps: Callable[[str], Iterable[tupl
     Raises:
         StereoSfmError: nothing tells when the images were taken.
     """
-    tables = [np.array([*itertools.islice(stamps(t), LOOKED_AT)], np.int64).reshape(-1, 2) for t in topics]
+    rows = [[*itertools.islice(stamps(topic), LOOKED_AT)] for topic in topics]
+    tables = [nanoseconds(itertools.chain(*row), name).reshape(-1, 2) for row in rows]
     headers, logs = ([table[:, k] for table in tables] for k in (0, 1))
     silent = [topic for topic, column in zip(topics, headers, strict=True) if not _runs(column)]
     if silent and not all(map(_runs, logs)):

@@ -184,7 +184,16 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, Exception) and self._whole.place != self.path and not self.closed:
+            self._leave()
         self.close()
+
+    def _leave(self) -> None:
+        """Close it as far as it was written, beside the older file of its name."""
+        self._guarded(self._mcap.finish)
+        self.closed = True
+        self._whole.close()
+        log.warning("%s is as it was; what was written until the error is in %s", self.path, self._whole.place)
 
     def _due(self, size: int, log_time: int, now: int) -> bool:
         since_log, since_publish = self._pending_since

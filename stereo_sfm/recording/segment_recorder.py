@@ -90,7 +90,7 @@ class SegmentRecorder:
         self.segment: Segment | None = None
         self._segment_ns = self._newest_ns = 0
         self._history: deque[tuple[Segment, int]] = deque()  # what a mark may reach; with the stamp of its beginning
-        self._marked_until_ns, self._mark_text = -1, ""
+        self._marks: dict[str, int] = {}  # text -> stamp until which new segments are marked with it
         self._next_thumbnail_ns = 0
         self._missed: list[StereoImage] = []  # images dropped since the last one kept, without their pixels
         self.images_dropped, self._dropped_s = 0, -SLOW_S
@@ -131,8 +131,8 @@ class SegmentRecorder:
     def mark(self, text: str) -> None:
         """Keep the recording around this moment."""
         now_ns = self._newest_ns
-        self._marked_until_ns = now_ns + int(self._policy.mark_after_s * 1e9)
-        self._mark_text = text
+        lasting = {other: until_ns for other, until_ns in self._marks.items() if until_ns >= now_ns}
+        self._marks = {**lasting, text: now_ns + int(self._policy.mark_after_s * 1e9)}
         from_ns, ends_ns = now_ns - int(self._policy.mark_before_s * 1e9), now_ns + 1
         for segment, begins_ns in reversed(self._history):
             if ends_ns <= from_ns:
@@ -190,9 +190,10 @@ class SegmentRecorder:
             self._history.popleft()
         for writer in (self._images, self._poses):
             writer.turn(self.segment)
-        if stamp_ns <= self._marked_until_ns:
-            with contextlib.suppress(OSError):
-                self.segment.mark(self._mark_text)
+        for text, until_ns in self._marks.items():
+            if stamp_ns <= until_ns:
+                with contextlib.suppress(OSError):
+                    self.segment.mark(text)
 
     def _make_folder_again(self) -> None:
         """Somebody deleted the folder: the recording goes on in another one of its name."""

@@ -44,6 +44,7 @@ class MapKeeper:
         self._again = False  # somebody asked while a save was under way: another one follows, for all of them
         self._failure = ""  # of the last one
         self._lock = threading.Condition(threading.Lock())  # of the store and of these, while they change
+        self._copying = threading.Lock()  # of copies beside it: two requests may name the same one
         self._ending = False
         self._last = False  # the last save was requested
         self._before: tuple[int, int] | None = None  # what was written at that request
@@ -212,7 +213,8 @@ class MapKeeper:
             if self._failure:
                 return Reply(False, self._failure)
         if copy is not None:
-            copy_map(self.folder, copy)
+            with self._copying:
+                copy_map(self.folder, copy)
         return Reply(True, f"saved to {copy or self.folder}")
 
     def switch(self, folder: Path) -> None:

@@ -330,3 +330,10 @@ def test_a_distortion_that_no_lens_has_is_refused_in_one_line(camera: type[Camer
     lens = camera(64, 48, 50, 50, 32, 24, (0.1, value, 0.0, 0.0))
     with pytest.raises(StereoSfmError, match="invalid calibration of the left camera: distortion"):
         Rig(lens)
+
+
+def test_a_focal_length_that_no_camera_has_is_refused() -> None:
+    """Rectified to it, an image would have more pixels than the memory holds."""
+    with pytest.raises(StereoSfmError, match=r"invalid calibration of the left camera: fx 100000$"):
+        Rig(Pinhole(64, 48, 1e5, 50.0, 32.0, 24.0))
+    Rig(Pinhole(64, 48, 6400.0, 6400.0, 32.0, 24.0))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.whole_file import WholeFile
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.record import record
+from stereo_sfm.types import StereoImage
 from tests.log.recordings import fisheye_rig, stereo_images, write_recording
 
 OTHER = """
@@ -69,6 +72,25 @@ def test_the_older_file_stays_until_the_new_one_is_whole(tmp_path: Path) -> None
     with pytest.raises(StereoSfmError, match="yielded no image"):
         list(record(MemorySource(fisheye_rig(), []), path, overwrite=True))
     assert _frames(path) == 1 and list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_leaves_the_older_file(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "drive.mcap"
+    write_recording(path, _source(5))
+
+    class Broken(MemorySource):
+        def __iter__(self) -> Iterator[StereoImage]:
+            yield from itertools.islice(super().__iter__(), 2)
+            raise StereoSfmError("the cable")
+
+    with pytest.raises(StereoSfmError, match="the cable"):
+        list(record(Broken(fisheye_rig(), stereo_images(4, np.random.default_rng(4))), path, overwrite=True))
+    part = tmp_path / "drive.part.mcap"
+    assert (_frames(path), _frames(part)) == (5, 2) and "what was written until the error is in" in caplog.text
+    new = tmp_path / "new.mcap"
+    with pytest.raises(StereoSfmError, match="the cable"):
+        list(record(Broken(fisheye_rig(), stereo_images(4, np.random.default_rng(4))), new))
+    assert _frames(new) == 2
 
 
 def test_a_full_disk_leaves_a_readable_file_and_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

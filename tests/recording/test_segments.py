@@ -248,6 +248,23 @@ def test_marks_keep_what_lies_around(tmp_path: Path) -> None:
     assert marked == [3, 4, 5, 6]
 
 
+def test_a_loss_does_not_take_over_a_mark_by_hand(tmp_path: Path) -> None:
+    """Else what a person wanted to keep ages."""
+    recorder = start(tmp_path, segment_s=0.49, mark_before_s=0.1, mark_after_s=1.2)
+    images = list(SlidingWall(150))
+    record(recorder, images[:60])
+    recorder.mark("bump")
+    record(recorder, images[60:66])
+    recorder.mark("lost: dark")
+    record(recorder, images[66:])
+    recorder.close(20.0)
+    found = segments(recorder.folder)
+    by_hand = [number for number, segment in enumerate(found) if segment.marked_by_hand]
+    alone = [number for number, segment in enumerate(found) if segment.marked and not segment.marked_by_hand]
+    assert len(by_hand) >= 3 and by_hand == list(range(by_hand[0], by_hand[-1] + 1))
+    assert all(number > by_hand[-1] for number in alone)
+
+
 def test_the_quota_is_kept_to_a_segment_however_fast_they_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

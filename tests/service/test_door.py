@@ -128,6 +128,22 @@ def test_idle_connections_do_not_close_the_page(rules: Access) -> None:
         output.close()
 
 
+def test_nobody_speaks_in_the_name_of_another_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Headers of proxies are a client's words: the connection decides whose attempts are counted."""
+    seen, visit = list[object](), Door.visit
+    monkeypatch.setattr(Door, "visit", lambda self, address: seen.append(tuple(address)) or visit(self, address))
+    output = PageOutput("127.0.0.1", 0, 4.0, Access(TOKEN))
+    output.open(FakeService())
+    try:
+        with _connect(output.port) as operator, _connect(output.port) as client:
+            forged = ":".join(map(str, operator.getsockname()))
+            client.sendall(f"GET /api/map HTTP/1.1\r\nHost: localhost\r\nX-Forwarded-For: {forged}\r\n\r\n".encode())
+            assert client.recv(15).startswith(b"HTTP/1.1 401")
+            assert set(seen) == {client.getsockname()}
+    finally:
+        output.close()
+
+
 def test_silent_connections_do_not_close_the_pose_socket() -> None:
     output = PoseSocket(Place.read("tcp://127.0.0.1:0"), "json", Access(TOKEN))
     output.open(FakeService())

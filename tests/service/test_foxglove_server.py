@@ -189,6 +189,17 @@ def test_settings_are_parameters() -> None:
     assert ("set_setting", {"name": "recording.mode", "value": "full"}) in service.calls
 
 
+def test_channels_that_are_no_numbers_end_no_connection() -> None:
+    service = FakeService({"status": Reply(True, "", {"settings": {"recording.mode": "off"}})})
+    with _serving(service) as (_, client):
+        for channel in ([], {}, "1", None, 1.5, True, 10**400):
+            client.send(json.dumps({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": channel}]}))
+            said = _wait(client, lambda said: said["message"] if said.get("op") == "status" else None)
+            assert "there is no channel" in said
+        client.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "a"}))
+        assert _wait(client, lambda said: said["parameters"] if said.get("op") == "parameterValues" else None)
+
+
 def _refused(output: FoxgloveOutput, path: str = "", **headers: str) -> int:
     """The status of a handshake, 101 where it succeeds."""
     more = {name.replace("_", "-"): value for name, value in headers.items()}

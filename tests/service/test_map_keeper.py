@@ -107,6 +107,30 @@ def test_a_requested_save_is_not_answered_by_an_earlier_one(tmp_path: Path) -> N
         assert all(reply.result(5.0).ok for reply in replies) and len(session.asked) == 2
 
 
+def test_two_copies_of_one_name_are_made_one_after_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    store, joined, copying = maps._store, list[Joined](), list[int]()  # pyright: ignore[reportPrivateUsage]
+    store.join, store.joined = lambda: None, lambda timeout_s=0.0: joined.pop() if joined else None
+
+    def copy_map(old: Path, new: Path) -> None:
+        copying.append(1)
+        time.sleep(0.05)
+        assert sum(copying) == 1
+        copying.append(-1)
+
+    monkeypatch.setattr("stereo_sfm.service.map_keeper.copy_map", copy_map)
+    with ThreadPoolExecutor(3) as pool:
+        replies = [pool.submit(maps.save_now, asked, "backup") for _ in range(3)]
+        while not all(reply.done() for reply in replies):
+            maps.session_saved(MapSaved("", 1))
+            joined.append(Joined(1))
+            maps.check(asked)
+            time.sleep(0.01)
+        assert all(reply.result().ok for reply in replies)
+    assert len(copying) == 6
+
+
 def test_a_folder_that_cannot_be_used_is_said_in_a_line() -> None:
     with pytest.raises(StereoSfmError, match=r"^cannot use map.folder /dev/null/store: Not a directory$"):
         MapKeeper(MapConfig("/dev/null/store"), Config()).begin()

@@ -105,6 +105,24 @@ def test_who_guesses_tokens_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) ->
     assert WRONG_AT_ONCE <= len(looked_at) <= WRONG_AT_ONCE + 3
 
 
+def test_a_page_of_another_site_locks_nobody_out() -> None:
+    """A browser sends requests where a page wants: they are no attempts of its visitor."""
+    with _listening(rules=Access(TOKEN)) as output:
+        for path in ("/", f"/{TOKEN}") * WRONG_AT_ONCE:
+            with socket.create_connection(("127.0.0.1", output.port), 5) as client:
+                client.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode())
+                assert _read_all(client) == b""
+        with socket.create_connection(("127.0.0.1", output.port), 5) as client:
+            client.sendall(TOKEN.encode() + b"\n")
+            _until(lambda: _clients(output) == 1)
+
+
+def _read_all(client: socket.socket) -> bytes:
+    with suppress(ConnectionError):  # it was closed with the rest of the request unread
+        return client.recv(100)
+    return b""
+
+
 def test_a_calibrated_body_is_the_robot() -> None:
     """A camera 1 m in front of the robot's centre: turning on the spot does not move the robot."""
     forward = np.array([[0.0, 0, 1, 1.0], [-1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])

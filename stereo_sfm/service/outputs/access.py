@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular
 from stereo_sfm.service.outputs.settings import SecurityConfig
 
 if TYPE_CHECKING:
@@ -180,7 +181,11 @@ def token_file(security: SecurityConfig) -> Path:
     """Where the token is: as configured, else in the folder for the state of the service's user."""
     if security.token_file:
         return Path(security.token_file)
-    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stereo-sfm" / "token"
+    try:
+        state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+    except RuntimeError:
+        raise StereoSfmError("this user has no home folder: set security.token_file") from None
+    return state / "stereo-sfm" / "token"
 
 
 def page_link(config: RobotConfig) -> str:
@@ -235,6 +240,8 @@ def _tls(security: SecurityConfig) -> ssl.SSLContext | None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
+        for file in filter(None, (security.tls_cert, security.tls_key)):
+            open_regular(Path(file)).close()  # a pipe would hold up whoever reads it
         context.load_cert_chain(security.tls_cert, security.tls_key or None)
     except (OSError, ssl.SSLError) as error:
         raise StereoSfmError(f"cannot use the certificate {security.tls_cert}: {error}") from None

@@ -43,6 +43,7 @@ def _uid(family: int, client: tuple[Any, ...], server: tuple[Any, ...]) -> str:
             answer = system.recv(4096)
     except OSError:
         return "?"
-    if len(answer) < _UID_AT + 4 or _HEADER.unpack_from(answer)[1] != _SOCK_DIAG:
+    if len(answer) < _UID_AT + 8 or _HEADER.unpack_from(answer)[1] != _SOCK_DIAG:
         return "?"
-    return str(struct.unpack_from("=I", answer, _UID_AT)[0])
+    uid, inode = struct.unpack_from("=2I", answer, _UID_AT)
+    return str(uid) if inode else "?"  # a socket that its process has closed is nobody's

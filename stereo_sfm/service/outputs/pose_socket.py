@@ -33,6 +33,7 @@ log = logging.getLogger("stereo_sfm")
 MOST_CLIENTS = 32
 BACKLOG = 128  # connections that the system holds until they are accepted
 BUFFER_BYTES = 1 << 16  # of the system for one client: a slow one is not far behind
+HTTP = " HTTP/1.0", " HTTP/1.1"  # how the first line of a request ends
 HANDSHAKE_BYTES = 4200
 SOCKET_MODE = 0o660
 
@@ -211,7 +212,10 @@ class PoseSocket:
                     visit.socket, server_side=True, do_handshake_on_connect=False
                 )
                 tls.do_handshake()
-            known = not self._rules.token or self._rules.allows(_first_line(visit.socket), visit.peer)
+            known = not self._rules.token
+            if not known:
+                line = _first_line(visit.socket)  # a page's request is no attempt: it must not lock out its visitor
+                known = not line.endswith(HTTP) and self._rules.allows(line, visit.peer)
             known = known and door.welcome(visit)
             if known:
                 _make_streaming(visit.socket)
@@ -232,9 +236,9 @@ def _make_streaming(connection: socket.socket) -> None:
 
 def _first_line(connection: socket.socket) -> str:
     data = b""
-    while not data.endswith(b"\n") and len(data) < HANDSHAKE_BYTES:
+    while b"\n" not in data and len(data) < HANDSHAKE_BYTES:
         more = connection.recv(HANDSHAKE_BYTES - len(data))
         if not more:
             break
         data += more
-    return data.decode("ascii").strip()
+    return data.partition(b"\n")[0].decode("ascii").strip()

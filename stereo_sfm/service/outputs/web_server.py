@@ -68,6 +68,7 @@ class WebServer:
             ws_per_message_deflate=False,
             log_level="critical",  # the guard answers what goes wrong
             access_log=False,
+            proxy_headers=False,  # who is at the other end is what the system says, not what the client does
             lifespan="off",
             timeout_keep_alive=int(IDLE_S),
             timeout_graceful_shutdown=1,
