@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import logging
 import os
 import signal
@@ -34,7 +33,6 @@ LOWEST_PRIORITY = 19
 RAISED = -5  # of a service's poses, where the system permits it: as much as others that share the core three times over
 AT_CAMERA_RATE = "capture", "tracker"  # their arrays are of the same sizes with every image
 HELPER = "loop"  # compiles a part of what the tracker needs in a first run, before its own kernels
-PR_SET_PDEATHSIG = 1  # sys/prctl.h
 UPSTREAM_LOST = 70  # exit code of a worker that ended because another one died
 
 
@@ -140,12 +138,6 @@ def raise_priority(stage: str = "") -> None:
     with contextlib.suppress(OSError, AttributeError):
         own = os.getpriority(os.PRIO_PROCESS, 0)
         os.setpriority(os.PRIO_PROCESS, 0, min(own, RAISED) + NICENESS.get(stage, 0))
-
-
-def end_with_parent() -> None:
-    """In a child that is another program: end with the thread that started it, however that ends (Linux)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def lower_priority(stage: str) -> None:

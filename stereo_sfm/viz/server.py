@@ -7,9 +7,11 @@ the user asks for another address.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib.util
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -18,13 +20,13 @@ from typing import Any
 from urllib.parse import quote
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.pipeline.child import end_with_parent
 
 LOOPBACK = "127.0.0.1"
 EVERYWHERE = ("0.0.0.0", "::")
 WEB_PORT, GRPC_PORT = 9090, 9876
 MEMORY_LIMIT = "1GB"  # of the viewer's history
 START_S = 20.0  # time for a viewer to start listening
+PR_SET_PDEATHSIG = 1
 
 
 def serve(address: str) -> tuple[str, str]:
@@ -76,6 +78,12 @@ def _executable() -> str:
     if viewer is None:
         raise StereoSfmError("cannot open the viewer: there is no 'rerun' (pip install rerun-sdk)")
     return viewer
+
+
+def end_with_parent() -> None:
+    """In a child that is another program: end with the thread that started it, however that ends (Linux)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _wait_for(process: subprocess.Popen[Any], address: str, *ports: int) -> None:

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.pipeline.child import end_with_parent
+from stereo_sfm.viz.server import end_with_parent
 
 NICE = 10
 
