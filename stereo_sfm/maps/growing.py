@@ -73,6 +73,7 @@ class GrowingMap:
         for gone in self._odometry.keys() - set(ids.tolist()):
             del self._odometry[gone]
             self._map.cull_keyframe(self._map.kf_row(gone))
+        self._joining.forget_loops()
         new = np.array([k not in self._odometry for k in ids.tolist()], bool)
         self._place(s, ids, new, place)
         pt_ids = self._enter_points(s, ids, new)

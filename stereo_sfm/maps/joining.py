@@ -56,6 +56,11 @@ class Joining:
         self.fused += len(fused)
         return applied
 
+    def forget_loops(self) -> None:
+        """Of culled keyframes: nothing asks for them, and a session that goes on all day has ever more."""
+        row, alive = self.map.kf_row, self.map.keyframes.alive
+        self.loops = [x for x in self.loops if alive[row(x.candidate_kf_id)] and alive[row(x.kf_id)]]
+
     def adjust(self, part: window.Window | None = None) -> None:
         """Bundle adjustment with the mapper's settings, of the whole map with the first keyframe fixed, or of a part.
 

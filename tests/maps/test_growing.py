@@ -75,9 +75,13 @@ def test_a_session_is_joined_as_it_goes_on() -> None:
         for one in (before_search, s.snapshot, done.saved.snapshot)
     ]
     assert (errors[0] < [0.03, np.radians(0.3)]).all() and (errors[1] < np.maximum(1.2 * errors[2], 0.004)).all()
-    gone = first(walk, len(walk) - 3)  # the session culled its last keyframes
+    joining = growing._joining  # pyright: ignore[reportPrivateUsage]
+    gone = first(walk, int(np.searchsorted(walk.snapshot.kf_ids, place.kf_id)) + 1)  # the session culled the rest
+    ends = {kf_id for loop in joining.loops for kf_id in (loop.candidate_kf_id, loop.kf_id)}
     growing.take(gone, place)
     assert len(growing.saved()) == len(saved) + len(gone)
+    left = {kf_id for loop in joining.loops for kf_id in (loop.candidate_kf_id, loop.kf_id)}
+    assert left and left < ends and all(joining.map.keyframes.alive[joining.map.kf_row(kf_id)] for kf_id in left)
 
 
 def test_what_the_session_culled_takes_no_memory() -> None:
