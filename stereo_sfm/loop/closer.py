@@ -170,6 +170,19 @@ class LoopCloser:
         self._side_database.add(keyframe.kf_id, bags[1])
         self._store.add(keyframe)
 
+    def forget(self, culled: set[int]) -> None:
+        """Keyframes that their map has culled are no candidates any more; those passed are taken out of the set."""
+        newest = self._store.ids[-1] if len(self._store) else -1
+        for kf_id in sorted(kf_id for kf_id in culled if kf_id <= newest - PASSED):
+            culled.remove(kf_id)
+            if kf_id in self._store:
+                self._remove(kf_id)
+
+    def _remove(self, kf_id: int) -> None:
+        self._graph.exclude(kf_id)
+        self._store.remove(kf_id)
+        self._own.pop(kf_id, None)
+
     def _cull(self, newest: int) -> list[int]:
         """Of many keyframes of one view keep the first and the last few, which bounds memory in a known place.
 
@@ -187,9 +200,7 @@ class LoopCloser:
         if came_back and self._repeated >= OF_EARLIER_VISITS:
             gone = settled
         if gone >= 0:
-            self._graph.exclude(gone)
-            self._store.remove(gone)
-            self._own.pop(gone, None)
+            self._remove(gone)
         self._repeated += came_back and gone < 0
         if (rows := self._graph.forget()) is not None:
             self._fronts.keep(rows)

@@ -50,6 +50,7 @@ class GrowingMap:
         self._part: SavedMap | None = None
         self._closer: LoopCloser | None = None
         self._queue: deque[Keyframe] = deque()  # not searched yet
+        self._culled: set[int] = set()  # by the session, of which the search may still have some
         self._bent = False  # by loops since the whole map was adjusted
 
     def take(self, part: SavedMap, place: LoopResult | None) -> None:
@@ -73,6 +74,7 @@ class GrowingMap:
         for gone in self._odometry.keys() - set(ids.tolist()):
             del self._odometry[gone]
             self._map.cull_keyframe(self._map.kf_row(gone))
+            self._culled.add(gone)
         self._joining.forget_loops()
         new = np.array([k not in self._odometry for k in ids.tolist()], bool)
         self._place(s, ids, new, place)
@@ -99,6 +101,7 @@ class GrowingMap:
             return True
         if not self._queue:
             return self._adjust()
+        self._closer.forget(self._culled)
         keyframe = self._queue.popleft()
         result = self._closer.step(keyframe, self._rigs[keyframe.kf_id])
         if result.candidate_kf_id >= 0 and keyframe.kf_id in self._odometry:

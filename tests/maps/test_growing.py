@@ -105,3 +105,36 @@ def test_what_the_session_culled_takes_no_memory() -> None:
     while once.work():
         pass
     assert len(s.kf_ids) == len(saved) + begin and len(s.pt_ids) == len(once.saved().snapshot.pt_ids)
+
+
+def test_a_session_that_goes_round_all_day_takes_no_more_memory() -> None:
+    """Its map keeps the newest round; what the joined map searches in and holds does not grow, and links stay."""
+    rounds = 7
+    whole = make_sequence([0] * (rounds + 1), seed=5, max_points=100)
+    half = len(whole.keyframes) // (rounds + 1)
+    before, after = (
+        dataclasses.replace(whole, keyframes=whole.keyframes[part], world_T_kf=whole.world_T_kf[part])
+        for part in (slice(0, half), slice(half, None))
+    )
+    vocabulary = voc.train([k.descriptors for k in before.keyframes], depth=3)
+    saved, walk = map_of_sequence(before), map_of_sequence(after)
+    done = update(saved, first(walk, half), vocabulary, LoopConfig(), MapperConfig())
+    begins, points = (int(ids.max()) + 1 for ids in (saved.snapshot.kf_ids, saved.snapshot.pt_ids))
+    loop = next(one for one in done.loops if one.candidate_kf_id < begins <= one.kf_id)
+    place = dataclasses.replace(loop, kf_id=loop.kf_id - begins, matches=loop.matches - np.array([0, points]))
+    growing, sizes, links = GrowingMap(saved, vocabulary, Config()), list[int](), list[int]()
+    for end in range(half, len(walk), half // 2):
+        s = walk.snapshot
+        newest = (np.arange(len(s.kf_ids)) < end) & (np.arange(len(s.kf_ids)) >= end - half)
+        obs = newest[s.obs_kf]
+        seen = np.bincount(s.obs_pt[obs], minlength=len(s.pt_ids)) > 0
+        part = dataclasses.replace(walk, snapshot=subset(s, newest, seen, obs), sessions=walk.sessions[newest])
+        growing.take(part, place)
+        while growing.work():
+            pass
+        closer = growing._closer  # pyright: ignore[reportPrivateUsage]
+        assert closer is not None
+        sizes.append(len(closer._store))  # pyright: ignore[reportPrivateUsage]
+        links.append(len(growing._joining.loops))  # pyright: ignore[reportPrivateUsage]
+        assert len(growing.saved()) == len(saved) + half
+    assert len(sizes) >= 10 and max(sizes[1:]) <= 1.1 * sizes[0] and min(links) > 0 and max(links) <= half

@@ -178,8 +178,12 @@ class FoxgloveClients:
     def _subscribe(self, client: Client, rows: list[dict[str, Any]]) -> None:
         for row in rows:
             number, channel = row.get("id"), row.get("channelId")
-            known = type(channel) is int and channel in self._ids
-            if type(number) is not int or not 0 <= number < 1 << 32 or not known:
+            if (
+                type(number) is not int
+                or type(channel) is not int
+                or channel not in self._ids
+                or not 0 <= number < 1 << 32
+            ):
                 raise StereoSfmError(f"there is no channel {str(channel)[:50]!r}")
             with self._lock:
                 numbers = client.subscriptions.get(channel, [])
