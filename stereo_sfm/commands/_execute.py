@@ -93,6 +93,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
             wall_s = time.perf_counter() - begin - session.waited_s(begin)
             stop.finished()
         stop.then = None
+        if problem is not None or interrupted:
+            record.warnings[f"the run ended early: {problem or 'it was interrupted'}"] = None
         folder, info = session.folder, session.info
         stats, evaluations = write_results(
             folder, info.name, info.rig, o.config, record, wall_s, info.ground_truth, o.frame, o.source.numbering,
