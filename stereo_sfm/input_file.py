@@ -36,7 +36,7 @@ def with_plain_numbers(tree: Any) -> Any:
         value = waiting.pop()
         if isinstance(value, dict):
             waiting += [*value, *value.values()]
-        elif isinstance(value, list):
+        elif isinstance(value, (list, tuple, set)):  # YAML has pairs and sets, too
             waiting += value
         elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
             raise ValueError(f"a whole number of {value.bit_length()} bits is too large")

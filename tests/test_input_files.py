@@ -176,6 +176,8 @@ def _doubled(form: str) -> str:
         (f"a: [{{b: -0x{'f' * 40}}}]", "too large"),
         (f"{'9' * 30}: 1", "too large"),
         ("height: 9223372036854775808", "too large"),
+        (f"a: !!pairs [b: {'9' * 30}]", "too large"),
+        (f"a: !!set {{{'9' * 30}}}", "too large"),
         ("a: !!timestamp x", "not what its tag says"),
         ('a: !!int ""', "not what its tag says"),
     ],

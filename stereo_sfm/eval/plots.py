@@ -149,10 +149,10 @@ def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
     figure = Figure(figsize=(8, 3))
     axes = figure.subplots(gridspec_kw={**FLAT, "right": 0.78})
     seconds, times = _seconds(record), record.times()
-    for stage in stages[:SHOWN_STAGES]:
-        axes.plot(seconds, times[stage], ".-", markersize=2, linewidth=1, label=stage)
-    shown = [times[stage] for stage in stages[:SHOWN_STAGES]]
-    everything = np.concatenate([np.zeros(0), *(ms[np.isfinite(ms)] for ms in shown)])
+    shown = {stage: times[stage] for stage in stages[:SHOWN_STAGES]}
+    for stage, ms in shown.items():
+        axes.plot(seconds, ms, ".-", markersize=2, linewidth=1, label=stage)
+    everything = np.concatenate([np.zeros(0), *(ms[np.isfinite(ms)] for ms in shown.values())])
     axes.set(xlabel="time [s]", ylabel="ms", title="time per stage")
     axes.set_ylim(0, 1.2 * float(np.percentile(everything, 99.5)) if len(everything) else 1)
     axes.grid(alpha=0.3)

@@ -40,7 +40,7 @@ REJECTIONS = {
 }
 FEW_INLIERS = 60  # median points per frame below which the pose is poorly constrained
 MIN_LENGTH_M = 1.0  # shortest path whose length is compared
-BIG_ERROR = 0.02  # of the path's length: of a scale above it the baseline is suspected
+BIG_ERROR = 0.02  # of the path's length, above which it is a warning; of its scale the baseline is suspected
 
 
 def write_report(

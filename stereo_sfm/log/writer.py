@@ -35,9 +35,8 @@ CHUNK_NS = 400_000_000
 class _File:
     """An unbuffered file: what `write` has returned from survives the death of this process."""
 
-    def __init__(self, file: WholeFile) -> None:
-        self._file, self._fd = file, file.fd
-        self._position = 0
+    def __init__(self, fd: int) -> None:
+        self._fd, self._position = fd, 0
 
     def write(self, data: bytes) -> int:
         view = memoryview(data)
@@ -52,9 +51,6 @@ class _File:
 
     def flush(self) -> None:
         """Nothing is buffered."""
-
-    def close(self) -> None:
-        self._file.finish()
 
 
 class _ChunkIndex:
@@ -100,7 +96,7 @@ class LogWriter:
             StereoSfmError: the file exists, cannot be created, or another process is writing it.
         """
         self._whole = WholeFile(path, overwrite)
-        self._file, self.path = _File(self._whole), path
+        self._file, self.path = _File(self._whole.fd), path
         self._clock = clock
         compression = CompressionType.ZSTD if compress else CompressionType.NONE
         self._mcap = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
@@ -166,11 +162,13 @@ class LogWriter:
 
     def close(self) -> None:
         """Write the index and close. Safe to call twice."""
-        if self.closed:
-            return
-        self._guarded(self._mcap.finish)
-        self.closed = True
-        self._file.close()
+        self._end(self._whole.finish)
+
+    def _end(self, close: Callable[[], None]) -> None:
+        if not self.closed:
+            self._guarded(self._mcap.finish)
+            self.closed = True
+            close()
 
     def discard(self) -> None:
         """Remove it; an older file of its name stays."""
@@ -184,16 +182,10 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, Exception) and self._whole.place != self.path and not self.closed:
-            self._leave()
-        self.close()
-
-    def _leave(self) -> None:
-        """Close it as far as it was written, beside the older file of its name."""
-        self._guarded(self._mcap.finish)
-        self.closed = True
-        self._whole.close()
-        log.warning("%s is as it was; what was written until the error is in %s", self.path, self._whole.place)
+        beside = isinstance(error, Exception) and self._whole.place != self.path and not self.closed
+        self._end(self._whole.close if beside else self._whole.finish)
+        if beside:  # an older file, which what is not whole does not replace
+            log.warning("%s is as it was; what was written until the error is in %s", self.path, self._whole.place)
 
     def _due(self, size: int, log_time: int, now: int) -> bool:
         since_log, since_publish = self._pending_since

@@ -21,7 +21,7 @@ def run_command(arguments: Sequence[str], timeout_s: float) -> str:
     """
     command = [sys.executable, "-m", "stereo_sfm.cli", *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=_below)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=_in_background)
     except subprocess.TimeoutExpired:
         raise StereoSfmError(f"stereo-sfm {arguments[0]} took longer than {timeout_s:.0f} s") from None
     if done.returncode:
@@ -29,6 +29,7 @@ def run_command(arguments: Sequence[str], timeout_s: float) -> str:
     return done.stdout
 
 
-def _below() -> None:
+def _in_background() -> None:
+    """In the child."""
     os.nice(NICE)
     end_with_parent()
