@@ -127,6 +127,7 @@ def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterato
         yield of[job.name], {"recording": of[job.name].spec, **result}
 
 
+CELL = 160  # letters of a cell that people read
 COLUMNS = ("recording", "frames", "tracked %", "keyframes", "loops", "path m", "ATE mm", "frames/s", "result")
 
 
@@ -149,9 +150,13 @@ def table_row(name: str, result: dict[str, Any]) -> list[Any]:
     ]
 
 
+def _shown(cell: str) -> str:
+    return cell if len(cell) <= CELL else f"{cell[: CELL - 1]}…"
+
+
 def write_results(rows: Sequence[Sequence[Any]], folder: Path) -> None:
-    """results.md for people; results.csv and results.parquet for programs, where what is missing is empty."""
-    shown = [["-" if cell is None else str(cell) for cell in row] for row in rows]
+    """results.md for people; results.csv and results.parquet for programs, whole, where what is missing is empty."""
+    shown = [["-" if cell is None else _shown(str(cell)) for cell in row] for row in rows]
     lines = [f"| {' | '.join(r)} |" for r in (COLUMNS, ["---"] * len(COLUMNS), *shown)]
     (folder / "results.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     write_table(folder / "results", COLUMNS, rows)

@@ -48,6 +48,14 @@ def test_a_missing_value_is_a_dash_empty_or_null(tmp_path: Path) -> None:
     assert columns["frames"] == [12, None] and columns["ATE mm"] == [2.5, None]
 
 
+def test_a_long_reason_is_short_for_people_and_whole_for_programs(tmp_path: Path) -> None:
+    reason = f"x is no dataset (known are {', '.join(map(str, range(200)))})"
+    batch.write_results([batch.table_row("x", {"ok": False, "error": reason})], tmp_path)
+    (line,) = (line for line in (tmp_path / "results.md").read_text().splitlines() if "no dataset" in line)
+    assert "failed: x is no dataset (known are 0, 1," in line and line.endswith("… |") and len(line) < 220
+    assert rows(tmp_path)[0]["result"] == f"failed: {reason}"
+
+
 def test_the_extra_brings_what_the_table_needs() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(extras["table"]) < set(extras["batch"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
@@ -11,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline.watchdog import process_state
+from stereo_sfm.service.outputs.background import run_command
 
 LONG = (
     "from stereo_sfm.service.outputs.background import run_command; "
@@ -41,3 +44,10 @@ def test_a_command_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> No
         waiting.send_signal(signal.SIGKILL)
         waiting.wait()
     wait_for("the command ends", lambda: process_state(command) in ("", "Z"))
+
+
+def test_a_command_that_fails_says_why_from_its_beginning(tmp_path: Path) -> None:
+    missing = tmp_path / ("long" * 60) / "walk.mcap"
+    with pytest.raises(StereoSfmError, match=f"^no such file or folder: {re.escape(str(tmp_path))}") as raised:
+        run_command(["info", str(missing)], 60)
+    assert len(str(raised.value)) <= 300

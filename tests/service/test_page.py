@@ -42,7 +42,7 @@ from stereo_sfm.service.publisher import COMMANDS, Reply
 from stereo_sfm.types import U8
 from tests.pipeline.test_pipeline import SlidingWall
 from tests.recording.test_segments import record, start
-from tests.service.browser import CHROMIUM, Browser
+from tests.service.browser import CHROMIUM, FIREFOX, Browser, Chromium, Firefox
 from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
 
 pytest.importorskip("starlette")
@@ -131,11 +131,19 @@ def _touch(browser: Browser, steps: list[list[tuple[int, int]]]) -> None:
 # -- in a browser ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(Chromium, marks=pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")),
+        pytest.param(Firefox, marks=pytest.mark.skipif(FIREFOX is None, reason="no Firefox")),
+    ],
+)
 @pytest.mark.parametrize(("width", "height"), [(1440, 900), (768, 1024), (390, 844)])
-def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path: Path) -> None:
+def test_an_operator_sees_and_does_everything(
+    kind: type[Chromium] | type[Firefox], width: int, height: int, tmp_path: Path
+) -> None:
     service = FakeService(_recordings(tmp_path))
-    with _serving(service, surface=str(tmp_path)) as output, Browser(width, height) as browser:
+    with _serving(service, surface=str(tmp_path)) as output, kind(width, height) as browser:
         stop = threading.Event()
         told: dict[str, Any] = {"state": ServiceState.RUNNING, "reason": "", "remedy": ""}
 
@@ -214,7 +222,7 @@ def test_a_link_logs_the_browser_in_once() -> None:
     with _serving(rules=Access(TOKEN)) as output:
         _show(output, 1)
         for first in (True, False):
-            with Browser(800, 600) as browser:
+            with Chromium(800, 600) as browser:
                 browser.call("Page.navigate", url=f"http://127.0.0.1:{output.port}/#{code}")
                 shown = "document.getElementById('state').textContent === 'running'"
                 browser.until(shown if first else "!document.getElementById('login').hidden")
@@ -223,7 +231,7 @@ def test_a_link_logs_the_browser_in_once() -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_the_browser_asks_for_the_token() -> None:
-    with _serving(rules=Access(TOKEN)) as output, Browser(800, 600) as browser:
+    with _serving(rules=Access(TOKEN)) as output, Chromium(800, 600) as browser:
         _show(output, 1)
         browser.go(f"http://127.0.0.1:{output.port}/")
         browser.until("!document.getElementById('login').hidden")
@@ -431,7 +439,7 @@ def test_an_operator_plays_a_recording_by_keyboard_in_the_dark(width: int, heigh
         }
     )
     press = "document.getElementById('%s').dispatchEvent(new KeyboardEvent('keydown', {key: '%s', bubbles: true}))"
-    with _serving(service) as output, Browser(width, height) as browser:
+    with _serving(service) as output, Chromium(width, height) as browser:
         browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
         _show(output, 1)
         browser.go(f"http://127.0.0.1:{output.port}/")
@@ -458,7 +466,7 @@ def test_an_operator_plays_a_recording_by_keyboard_in_the_dark(width: int, heigh
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_a_finger_scrolls_the_page_and_two_move_and_zoom_the_map() -> None:
-    with _serving() as output, Browser(390, 844) as browser:
+    with _serving() as output, Chromium(390, 844) as browser:
         browser.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
         _show(output, 1)
         browser.go(f"http://127.0.0.1:{output.port}/")
@@ -480,7 +488,7 @@ def test_a_finger_scrolls_the_page_and_two_move_and_zoom_the_map() -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
 def test_arrow_keys_move_the_map_and_a_reload_keeps_the_plots() -> None:
-    with _serving() as output, Browser(1440, 900) as browser:
+    with _serving() as output, Chromium(1440, 900) as browser:
         address = f"http://127.0.0.1:{output.port}/"
         _show(output, 1)
         browser.go(address)

@@ -11,6 +11,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.viz.server import end_with_parent
 
 NICE = 10
+LONGEST = 300  # letters of a reason
 
 
 def run_command(arguments: Sequence[str], timeout_s: float) -> str:
@@ -25,7 +26,9 @@ def run_command(arguments: Sequence[str], timeout_s: float) -> str:
     except subprocess.TimeoutExpired:
         raise StereoSfmError(f"stereo-sfm {arguments[0]} took longer than {timeout_s:.0f} s") from None
     if done.returncode:
-        raise StereoSfmError(" ".join(done.stderr.split())[-200:])
+        lines = done.stderr.strip().splitlines() or [f"it ended with {done.returncode}"]
+        said = lines[-1].removeprefix(f"stereo-sfm {arguments[0]}: ")
+        raise StereoSfmError(said[:LONGEST])
     return done.stdout
 
 
