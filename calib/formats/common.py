@@ -128,8 +128,9 @@ def rigid(values: Any, unit: float = 1.0) -> F64:
 def exact_rotation(transform: F64) -> F64:
     """(4, 4) with an orthonormal rotation; ValueError for a matrix that is not close to a rotation."""
     rotation = transform[:3, :3]
-    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if error > 1e-3 or np.linalg.det(rotation) < 0:
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e200 is no rotation's
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if not error <= 1e-3 or np.linalg.det(rotation) < 0:
         raise ValueError("a rotation matrix is not orthonormal")
     return se3.orthonormalize(transform) if error > 1e-14 else transform
 

@@ -333,13 +333,15 @@ def test_missing_file_and_format(tmp_path: Path) -> None:
             save_rig(Rig(Epipolar(10, 10, 5, 5, 5, 5)), tmp_path / "never", name)
 
 
-def test_scaled_rotation_is_refused(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("factor", [1.1, 1e200])
+def test_scaled_rotation_is_refused(factor: float, tmp_path: Path) -> None:
     save_rig(FISHEYE, tmp_path / "camchain.yaml", "kalibr")
     text = (tmp_path / "camchain.yaml").read_text()
     import yaml
 
     data = yaml.safe_load(text)
-    data["cam1"]["T_cn_cnm1"][0][0] *= 1.1
+    data["cam1"]["T_cn_cnm1"][0][0] *= factor
     (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(data))
     with pytest.raises(StereoSfmError, match="not orthonormal"):
         load_rig(tmp_path / "camchain.yaml")
