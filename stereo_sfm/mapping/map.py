@@ -220,9 +220,10 @@ class Map:
         return poses
 
     def move_points(self, rows: I64, xyz: F64) -> None:
-        """New positions in the map frame."""
-        self.points.xyz[rows] = xyz
-        self._changed_pt.append(np.asarray(rows, np.int64))
+        """New positions in the map frame; a point whose new one is not finite stays."""
+        good = np.isfinite(xyz).all(axis=1)
+        self.points.xyz[rows[good]] = xyz[good]
+        self._changed_pt.append(rows[good])
 
     def carry_points(self, before: F64, after: F64) -> None:
         """Points follow their anchors after a correction.

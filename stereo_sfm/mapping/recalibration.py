@@ -34,9 +34,7 @@ def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:
         map_.corners[row] = _placed(seen[0], before, after), _placed(seen[1], before, after)
     rows = map_.living_points()
     rows = rows[map_.points.obs_count[rows] > 0]
-    new = triangulate(map_, after, rows)
-    good = np.asarray(np.isfinite(new).all(1))
-    map_.move_points(rows[good], new[good])
+    map_.move_points(rows, triangulate(map_, after, rows))
 
 
 def _placed(corners: Corners, before: Rig, after: Rig) -> Corners:

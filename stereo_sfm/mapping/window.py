@@ -142,8 +142,8 @@ def write_back(map_: Map, part: Window, result: BundleResult) -> None:
         inside = part.bundle.motions.rows
         own = np.flatnonzero((inside >= 0) & ~part.bundle.fixed[inside])
         map_.keyframes.state[part.kf_rows[inside[own]]] = result.states[own]
-    sane = np.isfinite(result.points).all(axis=1) & map_.points.alive[part.pt_rows]
-    map_.move_points(part.pt_rows[sane], result.points[sane])
+    alive = map_.points.alive[part.pt_rows]
+    map_.move_points(part.pt_rows[alive], result.points[alive])
     table, obs = map_.observations, part.obs_rows
     wrong_left = ~result.inlier[:, 0] & np.isfinite(part.bundle.uv_left[:, 0])
     wrong_right = ~result.inlier[:, 1] & np.isfinite(part.bundle.uv_right[:, 0])

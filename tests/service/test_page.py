@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -277,6 +278,21 @@ def test_the_map_is_thinned_and_nothing_grows() -> None:
         live = output._state.snapshot()  # pyright: ignore[reportPrivateUsage]
     assert 1000 < len(shown["points"]) <= 6001 and 100 < len(shown["path"]) <= 3001
     assert len(json.loads(live)["events"]) == 60 and len(live) < 20_000
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_point_without_a_place_is_not_shown() -> None:
+    with _serving() as output:
+        output.put(started())
+        near = cloud(500, 10)
+        points = near.points.copy()
+        points[3], points[4, 1], points[5, 2] = np.nan, np.inf, -1e30
+        output.put(replace(near, points=points))
+        end = time.monotonic() + 10
+        while not (shown := json.loads(_ask(output, "GET", "/api/map")[1], parse_constant=pytest.fail))["points"]:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+    assert 400 < len(shown["points"]) <= 497 and np.abs(shown["points"]).max() < 1e3
 
 
 def test_the_floor_plan_is_in_the_axes_of_the_poses() -> None:

@@ -32,6 +32,7 @@ WIDEST = 640  # pixels of the image
 JPEG_QUALITY = 75
 WATCHED_S = 3.0  # images are drawn while one was requested within so many seconds
 MOST_POINTS, MOST_KEYFRAMES = 6000, 3000  # of the map as it is shown
+FARTHEST_M = 1e5  # of a point that is shown
 CELL_M = 0.05  # points of one cell are shown as one
 
 
@@ -79,7 +80,8 @@ class PageState:
         axes = self._axes
         if axes is None:
             return
-        points = _thinned(axes.points(cloud.points.astype(float)))
+        shown = cloud.points[(np.abs(cloud.points) < FARTHEST_M).all(axis=1)]  # others have no place in JSON
+        points = _thinned(axes.points(shown.astype(float)))
         path = axes.cameras(cloud.map_T_kf)[:, :3, 3]
         path = path[:: 1 + len(path) // MOST_KEYFRAMES]
         with self._lock:

@@ -116,15 +116,13 @@ def normal_equations(pose, velocity, points, rho, cameras, sigma, scale, normal,
     rhs[:] = 0.0
     for k in range(len(rho)):
         ir = 1.0 / rho[k]
-        px = origin[k, 0] + direction[k, 0] * ir
-        py = origin[k, 1] + direction[k, 1] * ir
-        pz = origin[k, 2] + direction[k, 2] * ir
         g = -ir * ir
         if rolling:
             exp_into(velocity, row_s[k], step)
             compose_into(pose, step, row)
         rows = point_residuals(
-            row, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+            row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
+            origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
             uv_l[k], uv_r[k], cameras, res, jac, ray,
         )  # fmt: skip
         if rows == 0:
