@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections import deque
 
@@ -18,7 +19,7 @@ from stereo_sfm.maps.cameras import difference, unified
 from stereo_sfm.maps.joining import Joining
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.maps.update import in_frame_of, without_superseded
-from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult
+from stereo_sfm.types import F64, I64, Keyframe, LoopResult
 
 _FRACTION = np.uint64(0x9E3779B97F4A7C15)  # of the golden ratio: it scatters equal differences
 
@@ -76,16 +77,17 @@ class GrowingMap:
             self._map.cull_keyframe(self._map.kf_row(gone))
             self._culled.add(gone)
         self._joining.forget_loops()
-        new = np.array([k not in self._odometry for k in ids.tolist()], bool)
-        self._place(s, ids, new, place)
-        pt_ids = self._enter_points(s, ids, new)
+        # With arrays of their own: views of the part's would keep all of it in memory, part after part.
+        keyframes = {k: copy.deepcopy(f) for k, f in enumerate(s.keyframes()) if int(ids[k]) not in self._odometry}
+        self._place(s, ids, keyframes, place)
+        pt_ids = self._enter_points(s, ids)
         if before is None and place is not None:
             known = dict(zip(s.pt_ids.tolist(), pt_ids.tolist(), strict=True))
             pairs = [(a, known[b]) for a, b in place.matches.tolist() if b in known]
             matches = np.array(pairs, np.int64).reshape(-1, 2)
             loop = dataclasses.replace(place, kf_id=place.kf_id + self._first_kf, matches=matches)
             self._joining.close(loop)
-        self._enqueue(s, ids, new, pt_ids)
+        self._enqueue(s, ids, keyframes, pt_ids)
         self._map.take_delta()  # nobody follows its changes
         if self._map.much_removed:
             self._map.compact(pt_ids)
@@ -121,7 +123,7 @@ class GrowingMap:
 
     # -- what the session mapped -------------------------------------------------------------------------------------
 
-    def _place(self, s: MapSnapshot, ids: I64, new: Bool, place: LoopResult | None) -> None:
+    def _place(self, s: MapSnapshot, ids: I64, keyframes: dict[int, Keyframe], place: LoopResult | None) -> None:
         """Add the new keyframes: each lies to the newest joined one of its submap as in the session."""
         poses, odometry = self._map.keyframes, self._odometry
         reference: dict[int, int] = {}  # submap -> index of its newest joined keyframe; -1: of any
@@ -132,25 +134,24 @@ class GrowingMap:
             at = s.map_T_kf[int(np.searchsorted(s.kf_ids, place.kf_id))]
             moved = se3.orthonormalize(candidate @ place.candidate_T_kf @ se3.inverse(at))
         rig = unified([*self._rigs.values(), self._part.rig if self._part else next(iter(self._rigs.values()))])[-1]
-        for k, keyframe in enumerate(s.keyframes()):
-            kf_id, submap = int(ids[k]), keyframe.submap_id
-            if new[k]:
+        for k, (kf_id, submap) in enumerate(zip(ids.tolist(), s.submap_ids.tolist(), strict=True)):
+            if k in keyframes:
                 near = reference.get(submap, reference.get(-1))
                 step = np.eye(4) if near is None else se3.inverse(s.map_T_kf[near]) @ s.map_T_kf[k]
-                own = keyframe.odom_T_cam
+                own = s.map_T_kf[k]
                 if near is not None:
                     moved_to = poses.map_T_kf[self._map.kf_row(int(ids[near]))] @ step
                     own = odometry[int(ids[near])] @ step if submap in reference else own
                 else:
                     assert moved is not None
                     moved_to = moved @ s.map_T_kf[k]
-                raised = dataclasses.replace(keyframe, kf_id=kf_id, submap_id=submap + self._first_submap)
+                raised = dataclasses.replace(keyframes[k], kf_id=kf_id, submap_id=submap + self._first_submap)
                 self._map.add_keyframe(raised, se3.orthonormalize(moved_to))
                 odometry[kf_id] = se3.orthonormalize(own)
                 self._rigs[kf_id], self._joining.session_of[kf_id] = rig, self._session
             reference[submap] = reference[-1] = k
 
-    def _enter_points(self, s: MapSnapshot, ids: I64, new: Bool) -> I64:
+    def _enter_points(self, s: MapSnapshot, ids: I64) -> I64:
         """Add new points and sightings, cull what the session culled. Returns (P,) the id here of each of its points.
 
         A point is known by what saw it: those that loops made of corners have other ids each time.
@@ -192,16 +193,14 @@ class GrowingMap:
 
     # -- loops -------------------------------------------------------------------------------------------------------
 
-    def _enqueue(self, s: MapSnapshot, ids: I64, new: Bool, pt_ids: I64) -> None:
+    def _enqueue(self, s: MapSnapshot, ids: I64, keyframes: dict[int, Keyframe], pt_ids: I64) -> None:
         """New keyframes for the search, with the ids of this map, after those that the session has not culled."""
         self._queue = deque(keyframe for keyframe in self._queue if keyframe.kf_id in self._odometry)
-        renamed = dataclasses.replace(s, kf_ids=ids, pt_ids=pt_ids)
-        for k, keyframe in enumerate(renamed.keyframes()):
-            if new[k]:
-                odometry = self._odometry[keyframe.kf_id]
-                stamp = keyframe.stamp_ns - int(s.stamp_ns[0])
-                submap = keyframe.submap_id + 1
-                self._queue.append(dataclasses.replace(keyframe, odom_T_cam=odometry, submap_id=submap, stamp_ns=stamp))
+        for k, keyframe in keyframes.items():
+            points = pt_ids[np.searchsorted(s.pt_ids, keyframe.point_ids)]
+            own = {"kf_id": int(ids[k]), "point_ids": points, "odom_T_cam": self._odometry[int(ids[k])]}
+            stamp, submap = keyframe.stamp_ns - int(s.stamp_ns[0]), keyframe.submap_id + 1
+            self._queue.append(dataclasses.replace(keyframe, submap_id=submap, stamp_ns=stamp, **own))
 
     def _close(self, loop: LoopResult) -> None:
         map_ = self._map

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from stereo_sfm.maps.growing import GrowingMap
 from stereo_sfm.maps.merge import subset
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.maps.update import Update, update
-from stereo_sfm.types import LoopResult
+from stereo_sfm.types import U8, LoopResult
 from tests.loop.store_sequence import StoreSequence, make_sequence
 from tests.maps.maps import map_of_sequence
 
@@ -123,12 +124,14 @@ def test_a_session_that_goes_round_all_day_takes_no_more_memory() -> None:
     loop = next(one for one in done.loops if one.candidate_kf_id < begins <= one.kf_id)
     place = dataclasses.replace(loop, kf_id=loop.kf_id - begins, matches=loop.matches - np.array([0, points]))
     growing, sizes, links = GrowingMap(saved, vocabulary, Config()), list[int](), list[int]()
+    parts = list[weakref.ref[U8]]()
     for end in range(half, len(walk), half // 2):
         s = walk.snapshot
         newest = (np.arange(len(s.kf_ids)) < end) & (np.arange(len(s.kf_ids)) >= end - half)
         obs = newest[s.obs_kf]
         seen = np.bincount(s.obs_pt[obs], minlength=len(s.pt_ids)) > 0
         part = dataclasses.replace(walk, snapshot=subset(s, newest, seen, obs), sessions=walk.sessions[newest])
+        parts.append(weakref.ref(part.snapshot.corner_descriptors))
         growing.take(part, place)
         while growing.work():
             pass
@@ -137,4 +140,5 @@ def test_a_session_that_goes_round_all_day_takes_no_more_memory() -> None:
         sizes.append(len(closer._store))  # pyright: ignore[reportPrivateUsage]
         links.append(len(growing._joining.loops))  # pyright: ignore[reportPrivateUsage]
         assert len(growing.saved()) == len(saved) + half
+    assert [part() is not None for part in parts] == [False] * (len(parts) - 1) + [True]
     assert len(sizes) >= 10 and max(sizes[1:]) <= 1.1 * sizes[0] and min(links) > 0 and max(links) <= half
