@@ -45,6 +45,11 @@ def from_os_error(error: OSError) -> StereoSfmError | None:
     return StereoSfmError(f"{error.filename}: {error.strerror}")
 
 
+def disk_is_full(error: BaseException) -> bool:
+    """Whether it says, or was raised because, nothing more fits on a disk."""
+    return any(isinstance(e, OSError) and e.errno in _FULL for e in (error, error.__context__))
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """ ", did you mean NAME?" with the nearest known word, ignoring case; "" if none is near."""
     from difflib import get_close_matches

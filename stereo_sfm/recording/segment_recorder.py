@@ -60,7 +60,7 @@ class RecorderState:
     bytes: int  # of all recordings
     images_dropped: int
     problem: str  # "" or one line
-    full: bool = False  # the problem is a full disk
+    full: bool = False  # the problem is a full disk, or quota
     seconds: int = 0  # from the first to the newest image
 
 
@@ -153,7 +153,7 @@ class SegmentRecorder:
         problem = next(filter(None, problems), "")
         return RecorderState(
             self.folder.name, "" if self.segment is None else self.segment.name, self._used, self.images_dropped,
-            problem, bool(self._poses.problem or self._no_room or self._images.problem),
+            problem, bool(self._no_room) or any(w.problem and w.full for w in (self._poses, self._images)),
             max(round((self._newest_ns - max(self._began_ns, 0)) / 1e9), 0),
         )  # fmt: skip
 

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from stereo_sfm.errors import StereoSfmError, from_os_error
+from stereo_sfm.errors import StereoSfmError, disk_is_full, from_os_error
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import encode_pair, encode_pixels, image_message
@@ -44,7 +44,7 @@ class _Writer:
         self.bytes_written = 0  # of the newest segment
         self._newest: Segment | None = None
         self._segment: Segment | None = None  # that is being written: others may wait before the newest
-        self.problem = ""
+        self.problem, self.full = "", False
         self._again_s = 0.0
         self._thread = threading.Thread(target=self._work, name=type(self).__name__, daemon=True)
         self._thread.start()
@@ -84,11 +84,14 @@ class _Writer:
                 else:
                     self._write(item)
             except (StereoSfmError, OSError) as error:
-                self.problem = _said(error)
+                self._problem_is(error)
                 self._again_s = time.monotonic() + AGAIN_S
                 self._failed(item)
         with contextlib.suppress(StereoSfmError, OSError):
             self._finish()
+
+    def _problem_is(self, error: StereoSfmError | OSError) -> None:
+        self.problem, self.full = _said(error), disk_is_full(error)
 
     def _begin(self, segment: Segment) -> None:
         raise NotImplementedError
@@ -200,7 +203,7 @@ class PoseWriter(_Writer):
                 self.problem = ""
                 return
             except (StereoSfmError, OSError) as error:
-                self.problem = _said(error)
+                self._problem_is(error)
             time.sleep(AGAIN_S)
 
     def _finish(self) -> None:

@@ -8,6 +8,7 @@ from multiprocessing.connection import Connection
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.errors import disk_is_full
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
@@ -84,7 +85,7 @@ class _Body:
         self._recorder: SegmentRecorder | None = None
         self._ring: ImageRing | None = None
         self._next_state_s = self._next_open_s = 0.0
-        self._problem = ""
+        self._problem, self._full = "", False
         self._begin: Begin | None = None
         self._uploader: Uploader | None = None  # goes on between sessions
 
@@ -120,9 +121,9 @@ class _Body:
                 return  # the pipeline has died: the next one begins another recording
         try:
             self._recorder = SegmentRecorder(begin.policy, begin.rig, begin.config, begin.source, begin.opening)
-            self._problem = ""
+            self._problem, self._full = "", False
         except OSError as error:
-            self._problem = f"cannot record to {begin.policy.root}: {error.strerror}"
+            self._problem, self._full = f"cannot record to {begin.policy.root}: {error.strerror}", disk_is_full(error)
 
     def _send_to(self, policy: Policy) -> None:
         """Send recordings to the bucket of this policy."""
@@ -162,7 +163,7 @@ class _Body:
         if time.monotonic() >= self._next_state_s:
             self._next_state_s = time.monotonic() + STATE_S
             recorder = self._recorder
-            state = RecorderState("", "", 0, 0, self._problem, bool(self._problem))
+            state = RecorderState("", "", 0, 0, self._problem, self._full)
             self._send(state if recorder is None else recorder.state())
 
     def finish(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import threading
@@ -337,6 +338,26 @@ def test_a_disk_that_refuses_everything_is_tried_again(tmp_path: Path, monkeypat
     recorder.close(20.0)
     poses = {r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.FRAME)}
     assert poses == set(range(60))
+
+
+@pytest.mark.parametrize(("number", "full"), [(errno.ENOSPC, True), (errno.EDQUOT, True), (errno.EIO, False)])
+def test_only_a_full_disk_is_called_full(
+    number: int, full: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = start(tmp_path)
+    images = list(SlidingWall(60))
+    record(recorder, images[:10])
+    wait_for(lambda: recorder._poses._queue.empty())  # pyright: ignore[reportPrivateUsage]
+
+    def refused(fd: int, data: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as broken:
+        broken.setattr("stereo_sfm.log.writer.os.write", refused)
+        record(recorder, images[10:20])
+        wait_for(lambda: os.strerror(number) in recorder.state().problem)
+        assert recorder.state().full == full
+        recorder.close(1.0)
 
 
 def test_a_slow_disk_drops_images_and_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

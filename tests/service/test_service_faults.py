@@ -233,6 +233,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     with running(config(tmp_path, tmp_path / "file" / "recordings")) as watched:
         wait_for(lambda: watched.states[-1].recording_problem)
         assert "cannot record to" in watched.states[-1].recording_problem
+        assert watched.states[-1].state == ServiceState.RUNNING  # and no advice about disk space
         watched.more_poses()
         assert watched.no_pose_is_missing()
 
