@@ -57,7 +57,7 @@ def read_gray(path: Path) -> U8 | U16:
 
 
 def read_depth(path: Path, scale: float) -> F32:
-    """A sixteen-bit depth image as (H, W) f32 metres, NaN where it holds 0.
+    """A sixteen-bit depth image as (H, W) f32 metres, NaN where it holds 0 or, as 7-Scenes' do, the largest number.
 
     Args:
         path: the file.
@@ -73,7 +73,7 @@ def read_depth(path: Path, scale: float) -> F32:
     if image.ndim != 2:
         raise UnreadableImage(str(path))
     depth = image.astype(np.float32)
-    depth[depth == 0] = np.nan
+    depth[(image == 0) | (image == np.iinfo(np.uint16).max)] = np.nan
     depth /= np.float32(scale)
     return depth
 

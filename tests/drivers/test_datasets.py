@@ -251,6 +251,13 @@ def test_depth_images_in_other_units(tmp_path: Path, caplog: pytest.LogCaptureFi
             depth = next(iter(source)).depth
         assert depth is not None and depth[5, 5] == pytest.approx(metres)
     assert "depth_scale" not in caplog.text
+    for unknown in (0, 65535):
+        holed = np.full((480, 640), 7500, np.uint16)
+        holed[5, 5] = unknown
+        cv2.imwrite(str(sorted((folder / "depth").glob("*.png"))[0]), holed)
+        with open_source(folder) as source:
+            depth = next(iter(source)).depth
+        assert depth is not None and np.isnan(depth[5, 5]) and depth[5, 6] == 1.5
     for file in sorted((folder / "depth").glob("*.png")):
         cv2.imwrite(str(file), np.full((480, 640), 700, np.uint16))  # 0.7 m in millimetres
     with open_source(folder):
