@@ -220,8 +220,8 @@ class Map:
         return poses
 
     def move_points(self, rows: I64, xyz: F64) -> None:
-        """New positions in the map frame; a point whose new one is not finite stays."""
-        good = np.isfinite(xyz).all(axis=1)
+        """New positions in the map frame; a point whose new one is NaN, or a thousand kilometres away, stays."""
+        good = (np.abs(xyz) < 1e6).all(axis=1)
         self.points.xyz[rows[good]] = xyz[good]
         self._changed_pt.append(rows[good])
 
