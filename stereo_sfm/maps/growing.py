@@ -197,10 +197,9 @@ class GrowingMap:
         """New keyframes for the search, with the ids of this map, after those that the session has not culled."""
         self._queue = deque(keyframe for keyframe in self._queue if keyframe.kf_id in self._odometry)
         for k, keyframe in keyframes.items():
-            points = pt_ids[np.searchsorted(s.pt_ids, keyframe.point_ids)]
-            own = {"kf_id": int(ids[k]), "point_ids": points, "odom_T_cam": self._odometry[int(ids[k])]}
-            stamp, submap = keyframe.stamp_ns - int(s.stamp_ns[0]), keyframe.submap_id + 1
-            self._queue.append(dataclasses.replace(keyframe, submap_id=submap, stamp_ns=stamp, **own))
+            points, ns = pt_ids[np.searchsorted(s.pt_ids, keyframe.point_ids)], keyframe.stamp_ns - int(s.stamp_ns[0])
+            here = {"kf_id": int(ids[k]), "point_ids": points, "odom_T_cam": self._odometry[int(ids[k])]}
+            self._queue.append(dataclasses.replace(keyframe, **here, submap_id=keyframe.submap_id + 1, stamp_ns=ns))
 
     def _close(self, loop: LoopResult) -> None:
         map_ = self._map

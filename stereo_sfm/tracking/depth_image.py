@@ -25,8 +25,10 @@ def points_from_depth(rig: Rig, depth: F32, uv: F64) -> tuple[F64, F64]:
     v = np.where(inside, np.rint(uv[:, 1]), 2).astype(np.int64)
     dv, du = np.mgrid[-2:3, -2:3][..., None]
     window = depth[v + dv, u + du]
-    whole, closed = ((a, inside & _smooth(a)) for a in (window[1:4, 1:4].reshape(9, -1), _closed(window)))
-    around, good = closed if closed[1].sum() > 2 * whole[1].sum() else whole  # most holes are the sensor's grid
+    around = window[1:4, 1:4].reshape(9, -1)
+    good = inside & _smooth(around)
+    if 2 * good.sum() < inside.sum() and (more := inside & _smooth(closed := _closed(window))).sum() > 2 * good.sum():
+        around, good = closed, more  # most holes are the sensor's grid
     bearing = rig.left.unproject(uv[good])
     points, uv_right = np.full((len(uv), 3), np.nan), np.full(uv.shape, np.nan)
     points[good] = bearing / bearing[:, 2:] * around.mean(0)[good, None]
