@@ -16,7 +16,7 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-MOST_TEXT = 256 << 20  # bytes of a text: a trajectory of a day at 30 Hz has some 200 MB
+MOST_TEXT = 1 << 30  # bytes of a text: a trajectory of a day at 30 Hz has some 200 MB
 MOST_BYTES = 2 << 30  # of any file that is read as a whole
 MOST_JSON = 64 << 20  # bytes; the numbers of a short run take some kilobytes
 MOST_YAML = 1 << 16  # bytes of what describes one picture
