@@ -20,15 +20,21 @@ from stereo_sfm.log.scan import build_index, check_magic, spans
 from stereo_sfm.log.whole_file import WholeFile
 
 
-def finish_in_place(path: Path, metadata: tuple[str, dict[str, str]] | None = None) -> int:
+def finish_in_place(
+    path: Path, metadata: tuple[str, dict[str, str]] | None = None, *, keep_chunks: bool = False
+) -> int:
     """Cut a file back to its last complete record and append the index; if needed, cut more chunks to make room for it.
 
     Args:
         path: the file.
         metadata: name and values of a record to add.
+        keep_chunks: cut no complete chunk; without room for the index the file has none.
 
     Returns:
         The number of messages in the finished file.
+
+    Raises:
+        OSError: it cannot be read or cut, or an index alone is too large.
     """
     with open_regular(path) as stream:
         index = build_index(stream)
@@ -36,11 +42,14 @@ def finish_in_place(path: Path, metadata: tuple[str, dict[str, str]] | None = No
         index.add_metadata(*metadata)
     with path.open("r+b", buffering=0) as stream:
         while True:
-            stream.truncate(index.end)
             stream.seek(index.end)
             try:
-                _write_all(stream.write, tail(index))
+                _write_all(stream.write, tail(index))  # over what follows: nobody else can take that room
+                stream.truncate()
             except OSError:
+                if keep_chunks:
+                    stream.truncate(index.end)
+                    return index.messages
                 if not index.chunks:
                     raise
                 index.drop_last_chunk()

@@ -35,16 +35,24 @@ CHUNK_NS = 400_000_000
 class _File:
     """An unbuffered file: what `write` has returned from survives the death of this process."""
 
-    def __init__(self, fd: int) -> None:
-        self._fd, self._position = fd, 0
+    def __init__(self, fd: int, again: Callable[[OSError], bool] | None) -> None:
+        self._fd, self._position, self._again = fd, 0, again
 
     def write(self, data: bytes) -> int:
         view = memoryview(data)
         while view:
-            written = os.write(self._fd, view)
+            try:
+                written = os.write(self._fd, view)
+            except OSError as error:
+                if self._again is None or self._is_deleted() or not self._again(error):
+                    raise
+                continue
             self._position += written
             view = view[written:]
         return len(data)
+
+    def _is_deleted(self) -> bool:
+        return not os.fstat(self._fd).st_nlink
 
     def tell(self) -> int:
         return self._position
@@ -83,6 +91,7 @@ class LogWriter:
         overwrite: bool = False,
         compress: bool = True,
         clock: Callable[[], int] = time.time_ns,
+        again: Callable[[OSError], bool] | None = None,
     ) -> None:
         """Create the file.
 
@@ -91,12 +100,14 @@ class LogWriter:
             overwrite: replace an existing file, when this one is whole.
             compress: zstd on every chunk; pointless for raw images of a real camera when speed matters.
             clock: wall clock in nanoseconds, for `publish_time` only.
+            again: asked when the disk refuses, may wait; True: go on where it refused. With it, a file that the disk
+                refuses for good loses no complete chunk, and is removed where it has no message.
 
         Raises:
             StereoSfmError: the file exists, cannot be created, or another process is writing it.
         """
         self._whole = WholeFile(path, overwrite)
-        self._file, self.path = _File(self._whole.fd), path
+        self._file, self.path, self._keep_chunks = _File(self._whole.fd, again), path, again is not None
         self._clock = clock
         compression = CompressionType.ZSTD if compress else CompressionType.NONE
         self._mcap = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
@@ -214,12 +225,21 @@ class LogWriter:
             action()
         except OSError as error:
             self.closed = True
-            place = self._whole.place
-            messages = repair.finish_in_place(place)
-            self._whole.close()
-            self._failure = StereoSfmError(
-                f"recording stopped, {error.strerror or error}: {place} is closed and readable up to that point "
-                f"({messages} messages, {place.stat().st_size / 1e6:.1f} MB)"
-                + (f"; {self.path} is as it was" if place != self.path else "")
-            )
+            self._failure = StereoSfmError(f"recording stopped, {error.strerror or error}: {self._kept()}")
             raise self._failure from None
+
+    def _kept(self) -> str:
+        """Close what the disk refused to extend; what is left of it, for people."""
+        place, leave = self._whole.place, self._whole.close
+        as_it_was = f"; {self.path} is as it was" if place != self.path else ""
+        try:
+            messages = repair.finish_in_place(place, keep_chunks=self._keep_chunks) if self._file.tell() else 0
+            if not messages and (self._keep_chunks or not self._file.tell()):
+                leave = self._whole.discard
+                return f"{place} has no message and is removed{as_it_was}"
+            size = place.stat().st_size / 1e6
+            return f"{place} is closed and readable up to that point ({messages} messages, {size:.1f} MB){as_it_was}"
+        except (OSError, StereoSfmError):  # deleted meanwhile, a device, or no room
+            return f"{place} has no index{as_it_was}"
+        finally:
+            leave()

@@ -1,7 +1,8 @@
 """Records a run into segments without ever blocking it: a disk that is slow or full costs images, not poses.
 
 Two threads write the two files of a segment. Images wait in a short queue and are dropped when it is full, poses in a
-long one. When the disk is full, images stop first (`min_free`); poses continue in what is left, then in a reserve.
+long one. When the disk is full, images stop first (`min_free`); poses continue in what is left, then in a reserve,
+then wait for room.
 """
 
 from __future__ import annotations
@@ -207,7 +208,7 @@ class SegmentRecorder:
         self._dropped_s = time.monotonic()
         self._missed.append(replace(image, left=image.left[:0], right=None, depth=None))
         del self._missed[:-1000]
-        why = self._no_room or "the disk is slow"
+        why = self._no_room or self._images.problem or "the disk is slow"
         self._poses.put(Dropped(image.frame_id, image.stamp_ns, "log", why))
 
     def _with_missed(self, image: StereoImage) -> StereoImage:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import queue
 import threading
 import time
@@ -37,22 +38,24 @@ class Thumbnail:
 
 
 class _Writer:
-    """A thread that writes one file of each segment."""
+    """A thread that writes one file of each segment. When the disk is full it waits, then goes on in the same file."""
 
-    def __init__(self, limit: int) -> None:
-        self._queue: queue.Queue[Any] = queue.Queue(limit)
+    def __init__(self, limit: int, make_room: Callable[[], None]) -> None:
+        self._queue: queue.Queue[tuple[Segment, Any] | None] = queue.Queue(limit)
+        self._make_room, self._closing = make_room, threading.Event()
         self.bytes_written = 0  # of the newest segment
         self._newest: Segment | None = None
         self._segment: Segment | None = None  # that is being written: others may wait before the newest
+        self._on_disk = 0  # bytes of its file
         self.problem, self.full = "", False
-        self._again_s = 0.0
         self._thread = threading.Thread(target=self._work, name=type(self).__name__, daemon=True)
         self._thread.start()
 
     def put(self, item: object) -> bool:
-        """Queue an item; False when the queue is full."""
+        """Queue an item of the newest segment; False when the queue is full."""
         try:
-            self._queue.put_nowait(item)
+            if self._newest is not None:
+                self._queue.put_nowait((self._newest, item))
         except queue.Full:
             return False
         return True
@@ -60,15 +63,18 @@ class _Writer:
     def turn(self, segment: Segment) -> None:
         """What is queued from now on belongs to another segment."""
         self._newest, self.bytes_written = segment, 0
-        self.put(segment)
 
-    def _count(self, written: int) -> None:
-        """So many bytes are in the file of the segment that is being written."""
+    def _count(self, written: int) -> bool:
+        """So many bytes are in the file of the segment that is being written; whether the disk has taken some now."""
+        if taken := written != self._on_disk:
+            self._on_disk, self.problem = written, ""
         if self._segment is self._newest:
             self.bytes_written = written
+        return taken
 
     def close(self) -> None:
-        """Nothing more comes."""
+        """Nothing more comes; a full disk is tried once more."""
+        self._closing.set()
         with contextlib.suppress(queue.Full):
             self._queue.put(None, timeout=0.5)
 
@@ -77,21 +83,30 @@ class _Writer:
         self._thread.join(seconds)
 
     def _work(self) -> None:
-        while (item := self._queue.get()) is not None:
+        while (queued := self._queue.get()) is not None:
+            segment, item = queued
             try:
-                if isinstance(item, Segment):
-                    self._begin(item)
-                else:
-                    self._write(item)
+                if segment is not self._segment:
+                    self._begin(segment)
+                self._write(item)
             except (StereoSfmError, OSError) as error:
                 self._problem_is(error)
-                self._again_s = time.monotonic() + AGAIN_S
                 self._failed(item)
         with contextlib.suppress(StereoSfmError, OSError):
             self._finish()
 
     def _problem_is(self, error: StereoSfmError | OSError) -> None:
         self.problem, self.full = _said(error), disk_is_full(error)
+
+    def _again(self, error: OSError) -> bool:
+        """Make room and wait; False where the file cannot go on, or nobody waits any more."""
+        tried = self.problem and self._closing.is_set()
+        self._problem_is(error)
+        if tried or error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            return False
+        self._make_room()
+        self._closing.wait(AGAIN_S)
+        return True
 
     def _begin(self, segment: Segment) -> None:
         raise NotImplementedError
@@ -107,33 +122,37 @@ class _Writer:
 
 
 class ImageWriter(_Writer):
-    """Images of each segment; those that the disk refuses are dropped."""
+    """Images of each segment; those that the disk refuses, or that find the queue full, are dropped."""
 
-    def __init__(self, image_format: str, begin: Callable[[LogWriter], ImageLog], refused: Callable[[], None]) -> None:
-        self._format, self._begin_log, self._refused = image_format, begin, refused
+    def __init__(
+        self, image_format: str, begin: Callable[[LogWriter], ImageLog], make_room: Callable[[], None]
+    ) -> None:
+        self._format, self._begin_log = image_format, begin
         self._file: LogWriter | None = None
         self._log: ImageLog | None = None
-        super().__init__(IMAGES_WAITING)
+        self._again_s = 0.0
+        super().__init__(IMAGES_WAITING, make_room)
 
     def _begin(self, segment: Segment) -> None:
-        self._finish()
         self._segment = segment
+        self._finish()
 
     def _write(self, item: StereoImage) -> None:
         if self._segment is None or time.monotonic() < self._again_s:
             return
         if self._log is None:
-            self._file = LogWriter(_unused(self._segment.images), compress=self._format != "raw")
+            path, compress = _unused(self._segment.images), self._format != "raw"
+            self._file = LogWriter(path, compress=compress, again=self._again)
             self._log = self._begin_log(self._file)
         assert self._file is not None
         self._log.image(encode_pair(item, self._format, decode=False))
         self._count(self._file.bytes_written)
-        self.problem = ""
 
     def _failed(self, item: Any) -> None:
+        self._again_s = time.monotonic() + AGAIN_S
         if self._file is not None and self._file.closed:
             self._file = self._log = None
-        self._refused()
+        self._make_room()
 
     def _finish(self) -> None:
         file, self._file, self._log = self._file, None, None
@@ -142,42 +161,37 @@ class ImageWriter(_Writer):
 
 
 class PoseWriter(_Writer):
-    """Everything but images. What the disk refuses is tried again, after room was made."""
+    """Everything but images."""
 
     def __init__(self, begin: Callable[[LogWriter], RunLog], make_room: Callable[[], None]) -> None:
-        self._begin_log, self._make_room = begin, make_room
+        self._begin_log = begin
         self._file: LogWriter | None = None
         self._log: RunLog | None = None
-        self._closing = False
         self._unwritten: list[object] = []  # since the newest chunk that is on disk
-        self._last_chunk: list[object] = []  # in a file that the disk refused to extend
-        super().__init__(MESSAGES_WAITING)
-
-    def close(self) -> None:
-        self._closing = True
-        super().close()
+        super().__init__(MESSAGES_WAITING, make_room)
 
     def _begin(self, segment: Segment) -> None:
-        self._segment = segment
-        file = LogWriter(_unused(segment.poses))
-        if self._log is None:
-            self._log = self._begin_log(file)
-        else:
-            self._log.next_file(file)
-        self._file, self.problem = file, ""
-        self._last_chunk, self._unwritten = [], []
+        self._segment, self._file = segment, None
+        file = LogWriter(_unused(segment.poses), again=self._again)
+        try:
+            if self._log is None:
+                self._log = self._begin_log(file)
+            else:
+                self._log.next_file(file)
+        except BaseException:
+            file.discard()
+            raise
+        self._file, self._unwritten = file, []
 
     def _write(self, item: object) -> None:
         if self._log is None or self._file is None:
-            return  # before the first image
-        before = self._file.bytes_written
+            return  # at the end nobody waits for a disk that refuses
         if isinstance(item, Thumbnail):
             self._thumbnail(item.image)
         else:
             self._log.put(item)
-        self._count(self._file.bytes_written)
-        if self._file.bytes_written != before:
-            self._last_chunk, self._unwritten = self._unwritten, []
+        if self._count(self._file.bytes_written):
+            self._unwritten = []
         self._unwritten.append(item)
 
     def _thumbnail(self, image: StereoImage) -> None:
@@ -190,21 +204,19 @@ class PoseWriter(_Writer):
         self._file.write(topics.THUMBNAIL, stamped, image.stamp_ns, image.frame_id)
 
     def _failed(self, item: Any) -> None:
-        """Make room and write what may not be on disk into another file, until the disk takes it."""
-        waiting = [*self._last_chunk, *self._unwritten, item]
-        while not self._closing:
+        """Write what may not be on disk into another file, until the disk takes it. Nothing where the file goes on."""
+        assert self._segment is not None
+        waiting = [*self._unwritten, item]
+        while (self._file is None or self._file.closed) and not self._closing.is_set():
             self._make_room()
             try:
-                if self._segment is not None and (self._file is None or self._file.closed):
-                    self._begin(item if isinstance(item, Segment) else self._segment)
+                self._begin(self._segment)
                 for message in waiting:
-                    if not isinstance(message, Segment):
-                        self._write(message)
-                self.problem = ""
+                    self._write(message)
                 return
             except (StereoSfmError, OSError) as error:
                 self._problem_is(error)
-            time.sleep(AGAIN_S)
+            self._closing.wait(AGAIN_S)
 
     def _finish(self) -> None:
         if self._log is not None:
@@ -218,10 +230,9 @@ def _said(error: StereoSfmError | OSError) -> str:
 
 
 def _unused(path: Path) -> Path:
-    """The path, or one beside it where a file that the disk refused to finish has that name."""
-    if not path.exists():
-        return path
-    stem = path.name.partition(".")[0]
-    suffix = path.name[len(stem) :]
-    taken = (path.with_name(f"{stem}{chr(k)}{suffix}") for k in range(ord("b"), ord("z") + 1))
-    return next((other for other in taken if not other.exists()), path)
+    """The path, or the next one with b, ... z, zb, ... where files that a disk refused to extend have that name."""
+    name, dot, suffix = path.name.partition(".")
+    while path.exists():
+        name = f"{name[:-1]}{chr(ord(name[-1]) + 1)}" if "a" < name[-1] < "z" else f"{name}b"
+        path = path.with_name(name + dot + suffix)
+    return path

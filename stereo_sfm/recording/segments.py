@@ -35,7 +35,7 @@ SENT = "SHA256SUMS"  # of a recording: its files that are in a bucket, with thei
 SENT_END = b"# complete\n"  # its last line when all are there
 AUTOMATIC = "lost: "  # a mark that begins like this is the service's own
 _FOLDER = re.compile(r"(\d{5,})_[\d_-]+")
-_SEGMENT = re.compile(r"(\d{5,})_(\d{6,})[a-z]?")  # a letter: begun again after the disk refused a file
+_SEGMENT = re.compile(r"(\d{5,})_(\d{6,})[a-z]*")  # letters: begun again after the disk refused a file
 
 
 @dataclass(frozen=True)
