@@ -26,7 +26,7 @@ from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbnail
-from stereo_sfm.recording.segments import RECORDING, Segment, describe, new_recording
+from stereo_sfm.recording.segments import RECORDING, Segment, about, describe, new_recording
 from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage, WheelSamples
 
 EVERY_S = 2.0  # between two checks of the disk, besides those at the beginning of a segment
@@ -175,14 +175,13 @@ class SegmentRecorder:
         if self._began_ns < 0:
             self._began_ns = stamp_ns
             with contextlib.suppress(OSError):
-                (self.folder / RECORDING).touch()  # the beginning by the clock of the disk, for `listed`
+                os.utime(self.folder / RECORDING)  # the beginning by the clock of the disk, for `listed`
         p, written = self._policy, self._images.bytes_written + self._poses.bytes_written
         full = stamp_ns - self._segment_ns >= p.segment_s * 1e9 or written >= p.segment_bytes
         self._newest_ns = stamp_ns
         if self.segment is not None and not (full or self._folder_gone):
             return
-        if self._folder_gone:
-            self._make_folder_again()
+        self._folder_gone = False
         self.segment = Segment.of(self.folder, self._number, max(round((stamp_ns - self._began_ns) / 1e9), 0))
         self._number, self._segment_ns = self._number + 1, stamp_ns
         self._due.set()  # the quota is never exceeded by more than a segment, however fast they follow each other
@@ -195,13 +194,6 @@ class SegmentRecorder:
             if stamp_ns <= until_ns:
                 with contextlib.suppress(OSError):
                     self.segment.mark(text)
-
-    def _make_folder_again(self) -> None:
-        """Somebody deleted the folder: the recording goes on in another one of its name."""
-        self._folder_gone = False
-        with contextlib.suppress(OSError):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            describe(self.folder, *self._about)
 
     def _drop(self, image: StereoImage) -> None:
         self.images_dropped += 1
@@ -238,7 +230,8 @@ class SegmentRecorder:
 
     def _check_disk(self) -> None:
         p, current = self._policy, self.segment
-        self._folder_gone = not (self.folder / RECORDING).exists()
+        if not about(self.folder):
+            self._make_folder_again()
         if p.mode == "black_box":
             forget_images(p.root, p.black_box_s, p.segment_s, current)
         excess = make_room(p.root, p.quota, current, self._disk)
@@ -254,6 +247,13 @@ class SegmentRecorder:
             self._no_room = ""
             if not self._poses.problem:
                 self._keep_reserve()
+
+    def _make_folder_again(self) -> None:
+        """Somebody deleted the folder: the recording goes on in another one of its name, and in another segment."""
+        with contextlib.suppress(OSError):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            describe(self.folder, *self._about)
+            self._folder_gone = True
 
     def _make_room_now(self) -> None:
         """The disk refused poses: delete what may be deleted, give up the reserve."""

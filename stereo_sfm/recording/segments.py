@@ -170,13 +170,19 @@ def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
 
 
 def describe(folder: Path, source: str, mode: str, began: datetime) -> None:
-    """Write the recording.json of a folder.
+    """Write the recording.json of a folder, whole or not at all.
 
     Raises:
         OSError: it cannot be written.
     """
     about = {"kind": KIND, "version": 1, "source": source, "mode": mode, "began": began.isoformat(timespec="seconds")}
-    (folder / RECORDING).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    part = folder / f"{RECORDING}.part"
+    try:
+        part.write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        part.replace(folder / RECORDING)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
 
 
 def about(folder: Path) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording import segment_recorder, segment_writers
 from stereo_sfm.recording.quota import Disk, Quota
 from stereo_sfm.recording.segment_recorder import SegmentRecorder
-from stereo_sfm.recording.segments import RECORDING, segments
+from stereo_sfm.recording.segments import RECORDING, about, describe, recordings, segments
 from stereo_sfm.types import StereoImage
 from tests.pipeline.test_pipeline import SlidingWall
 from tests.recording.test_segments import frame, record, start, wait_for
@@ -317,3 +317,31 @@ def test_a_file_that_cannot_be_finished_is_closed(tmp_path: Path, disk: Refusing
     with pytest.raises(StereoSfmError, match="has no message and is removed"):
         LogWriter(tmp_path / "b.mcap")
     assert opened(tmp_path) == [] and list(tmp_path.iterdir()) == []
+
+
+def test_recording_json_is_whole_or_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segment_recorder, "EVERY_S", 0.02)
+    recorder = start(tmp_path, mode="lean", segment_s=1e9)
+    (recorder.folder / RECORDING).write_bytes(b"")  # as an older version left it
+    wait_for(lambda: about(recorder.folder))
+
+    def full(self: Path, text: str, **_: object) -> int:
+        self.write_bytes(text.encode()[:10])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    put(recorder, 20)
+    with monkeypatch.context() as broken:
+        broken.setattr(Path, "write_text", full)
+        with pytest.raises(OSError, match="No space"):
+            describe(recorder.folder, *recorder._about)  # pyright: ignore[reportPrivateUsage]
+        assert about(recorder.folder)["source"] == "wall" and not list(recorder.folder.glob("*.part"))
+        wait_for(idle(recorder))
+        recorder.folder.rename(tmp_path / "elsewhere")
+        wait_for(recorder.folder.exists)
+        before = recorder.segment
+        put(recorder, 20, 20)
+        assert recorder.segment == before and not about(recorder.folder)  # no new segment for every check
+    wait_for(lambda: about(recorder.folder))
+    put(recorder, 20, 40)
+    recorder.close(20.0)
+    assert recordings(tmp_path) == [recorder.folder] and of(recorder.folder)[-20:] == list(range(40, 60))
