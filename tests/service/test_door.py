@@ -5,15 +5,17 @@ from __future__ import annotations
 import http.client
 import json
 import socket
+import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 
 import pytest
 
 from stereo_sfm.service.outputs import door
 from stereo_sfm.service.outputs.access import Access
-from stereo_sfm.service.outputs.door import STRANGERS, Door
+from stereo_sfm.service.outputs.door import STRANGERS, Door, Visit
 from stereo_sfm.service.outputs.pose_socket import Place, PoseSocket
 from stereo_sfm.service.page.server import PageOutput
 from tests.service.service_messages import FakeService, pose_update, started
@@ -28,8 +30,8 @@ def _by_source(connection: socket.socket) -> str:
 
 
 @contextmanager
-def _door(known: int = 4, handshake_s: float = 5.0) -> Iterator[Door]:
-    made = Door.of(socket.create_server(("127.0.0.1", 0)), known, handshake_s, _by_source)
+def _door(known: int = 4, handshake_s: float = 5.0, speak: bool = False) -> Iterator[Door]:
+    made = Door.of(socket.create_server(("127.0.0.1", 0)), known, handshake_s, _by_source, speak)
     try:
         yield made
     finally:
@@ -108,6 +110,99 @@ def test_time_counts_and_not_what_is_sent() -> None:
             server.rest(visit, 0.1)
             assert _is_closed(known)
             visit.socket.close()
+
+
+def test_who_comes_alone_is_served_before_a_crowd() -> None:
+    with _door(speak=True) as server, ExitStack() as open_ones:
+        port = server.getsockname()[1]
+        sources = ["127.0.0.3"] * (STRANGERS // 2) + ["127.0.0.2"] + ["127.0.0.3"] * (STRANGERS // 2 - 1)
+        for source in sources:  # none has to leave
+            open_ones.enter_context(_connect(port, source)).sendall(b"x")
+        visits = [server.visitor() for _ in sources]
+        assert [visit.peer for visit in visits] == sorted(sources)
+        for visit in visits:
+            visit.socket.close()
+
+
+def test_a_door_keeps_those_who_say_nothing() -> None:
+    """They leave it when their time is over, when they end, or with the door, and nobody else sees them."""
+    with _door(handshake_s=0.6, speak=True) as server, ExitStack() as open_ones:
+        port = server.getsockname()[1]
+        for _ in range(10):
+            _connect(port).close()
+        with pytest.raises(BlockingIOError):
+            server.accept()
+        assert not server._visits  # pyright: ignore[reportPrivateUsage]
+        silent = open_ones.enter_context(_connect(port))
+        with pytest.raises(BlockingIOError):
+            server.accept()
+        assert len(server._visits) == 1 and _is_closed(silent)  # pyright: ignore[reportPrivateUsage]
+    with _door(speak=True) as server, _connect(server.getsockname()[1]) as silent:
+        with pytest.raises(BlockingIOError):
+            server.accept()
+        server.close()
+        assert _is_closed(silent) and server.fileno() == -1
+        with pytest.raises(OSError, match="closed"):
+            server.visitor()
+
+
+def test_a_crowd_that_says_nothing_costs_the_page_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None of it reaches the web server, and the system may hold many: a longer queue loses fewer."""
+    given, accept = list[object](), Door.accept
+
+    def counted(self: Door) -> tuple[socket.socket, object]:
+        given.append(found := accept(self))
+        return found
+
+    monkeypatch.setattr(Door, "accept", counted)
+    output = PageOutput("127.0.0.1", 0, 4.0, Access(TOKEN))
+    output.open(FakeService())
+    try:
+        with ExitStack() as crowd:
+            for _ in range(3 * STRANGERS):
+                crowd.enter_context(_connect(output.port))
+            connection = http.client.HTTPConnection("127.0.0.1", output.port, timeout=5)
+            connection.request("GET", "/api/map", headers=BEARER)
+            assert connection.getresponse().status == 200 and len(given) == 1
+            connection.close()
+        web = output._web.door  # pyright: ignore[reportPrivateUsage]
+        assert web is not None and _queue(web) == _allowed(door.BACKLOG)
+    finally:
+        output.close()
+
+
+def test_a_crowd_that_says_nothing_costs_the_pose_socket_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, authenticate = list[Visit](), PoseSocket._authenticate  # pyright: ignore[reportPrivateUsage]
+
+    def counted(self: PoseSocket, server: Door, visit: Visit) -> None:
+        begun.append(visit)
+        authenticate(self, server, visit)
+
+    monkeypatch.setattr(PoseSocket, "_authenticate", counted)
+    output = PoseSocket(Place.read("tcp://127.0.0.1:0"), "json", Access(TOKEN))
+    output.open(FakeService())
+    try:
+        with ExitStack() as crowd:
+            for _ in range(3 * STRANGERS):
+                crowd.enter_context(_connect(output.port))
+            with _connect(output.port) as client:
+                client.sendall(TOKEN.encode() + b"\n")
+                _until(lambda: bool(output._clients))  # pyright: ignore[reportPrivateUsage]
+                assert len(begun) == 1
+        server = output._server  # pyright: ignore[reportPrivateUsage]
+        assert server is not None and _queue(server) == _allowed(door.BACKLOG)
+    finally:
+        output.close()
+
+
+def _queue(listening: socket.socket) -> int:
+    """Connections that the system holds for a listening socket."""
+    info = listening.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 32)
+    return int(struct.unpack_from("I", info, 28)[0])  # tcpi_sacked, of a socket that listens
+
+
+def _allowed(backlog: int) -> int:
+    return min(backlog, int(Path("/proc/sys/net/core/somaxconn").read_text()))
 
 
 @pytest.mark.parametrize("rules", [Access(TOKEN), Access()])

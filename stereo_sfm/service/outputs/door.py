@@ -2,12 +2,15 @@
 
 Connections are strangers until they have shown that they may be there. Strangers have few places and little time, by
 the clock and not by what they send; when all places are taken, the peer that has most of them loses its oldest. Those
-who are known have places of their own. A client that reads nothing is dropped by the system.
+who are known have places of their own. A client that reads nothing is dropped by the system. Where clients speak
+first, one that has said nothing costs its server nothing, and the peer that has fewest places is served first.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import select
 import socket
 import threading
 import time
@@ -23,6 +26,8 @@ HANDSHAKE_S = 5.0  # for TLS handshake, request and token together
 IDLE_S = 15.0  # for the next request of one who is known
 UNREAD_S = 10.0  # after which who does not read is dropped
 SWEEP_S = 0.25  # between two looks at the clock
+BACKLOG = 4096  # connections that the system holds until they are accepted; it may allow fewer
+AT_ONCE = 64  # connections that are accepted before the next that has spoken is served
 
 
 @dataclass(eq=False)
@@ -67,6 +72,7 @@ class Door(socket.socket):
         known: int = KNOWN,
         handshake_s: float | None = None,
         peer_of: Callable[[socket.socket], str] = peer,
+        speak: bool = False,
     ) -> Self:
         """A door in place of a listening socket.
 
@@ -74,11 +80,18 @@ class Door(socket.socket):
         known: places for those who are known.
         handshake_s: for strangers; None: HANDSHAKE_S.
         peer_of: names a connection's peer.
+        speak: clients speak first; those who have said nothing wait in the door.
         """
         door = cls(listening.family, listening.type, listening.proto, fileno=listening.detach())
         door._places, door._peer_of = known, peer_of
         door._handshake_s = HANDSHAKE_S if handshake_s is None else handshake_s
-        door._visits = set[Visit]()
+        door._visits, door._silent = dict[Visit, None](), dict[int, Visit]()
+        door._kind = door.family, door.type, door.proto
+        door._events = None
+        if speak:
+            door.setblocking(False)
+            door._events = select.epoll()
+            door._events.register(socket.socket.fileno(door), select.EPOLLIN)
         door._lock = threading.RLock()
         door._closed_now = threading.Event()
         threading.Thread(target=door._sweep, name="door", daemon=True).start()
@@ -87,13 +100,30 @@ class Door(socket.socket):
     _places: int
     _handshake_s: float
     _peer_of: Callable[[socket.socket], str]
-    _visits: set[Visit]
+    _visits: dict[Visit, None]  # the oldest first
+    _silent: dict[int, Visit]  # by the number of its socket
+    _kind: tuple[int, int, int]
+    _events: select.epoll | None  # of itself, and of those who have said nothing
     _lock: threading.RLock
     _closed_now: threading.Event
 
+    def fileno(self) -> int:
+        """What tells that `accept` may have a connection."""
+        number = super().fileno()
+        return number if self._events is None or number < 0 else self._events.fileno()
+
+    def listen(self, backlog: int = BACKLOG, /) -> None:
+        """It listens already; a server's own backlog changes nothing."""
+
     def accept(self) -> tuple[socket.socket, Any]:
-        """A connection and its address, as of any socket."""
-        visit = self.visitor()
+        """A connection and its address, as of any socket; where clients speak first, of one that does not block.
+
+        Raises:
+            OSError: as of `socket.accept`.
+        """
+        visit = self.visitor() if self._events is None else self._heard(self._events, 0.0)
+        if visit is None:
+            raise BlockingIOError(errno.EAGAIN, "nobody has spoken")
         return visit.socket, visit.address
 
     def visitor(self) -> Visit:
@@ -102,37 +132,71 @@ class Door(socket.socket):
         Raises:
             OSError: as of `socket.accept`.
         """
-        while True:
-            plain, address = super().accept()
-            try:
-                name = self._peer_of(plain)
-                if plain.family != socket.AF_UNIX:
-                    plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1e3))
-            except (OSError, ValueError):  # it is gone already
-                plain.close()
-                continue
-            connection = _Connection(plain.family, plain.type, plain.proto, fileno=plain.detach())
-            visit = Visit(connection, name, address, time.monotonic() + self._handshake_s)
-            connection.left = lambda visit=visit: self.leave(visit)
+        while not self._closed_now.is_set():
+            visit = self._enter() if self._events is None else self._heard(self._events, SWEEP_S)
+            if visit is not None:
+                return visit
+        raise OSError(errno.EBADF, "the door is closed")
+
+    def _enter(self) -> Visit | None:
+        """Accept one connection; None where it is gone already."""
+        plain, address = super().accept()
+        connection = _Connection(*self._kind, fileno=plain.detach())
+        try:
+            name = self._peer_of(connection)
+            if connection.family != socket.AF_UNIX:
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(UNREAD_S * 1e3))
+        except (OSError, ValueError):
+            connection.close()
+            return None
+        visit = Visit(connection, name, address, time.monotonic() + self._handshake_s)
+        connection.left = lambda: self.leave(visit)
+        with self._lock:
+            if self._events is not None:
+                self._silent[connection.fileno()] = visit
+                self._events.register(connection, select.EPOLLIN)
             self._add(visit)
-            return visit
+        return visit
+
+    def _heard(self, events: select.epoll, seconds: float) -> Visit | None:
+        """Let in who comes; one who has spoken, of the peer that has fewest places; None where nobody has."""
+        ready, listening = events.poll(seconds), super().fileno()
+        if listening in dict(ready):
+            with contextlib.suppress(BlockingIOError):
+                for _ in range(AT_ONCE):
+                    self._enter()
+            ready = events.poll(0.0)
+        with self._lock:
+            places = Counter(v.peer for v in self._visits if not v.known)
+            spoken = [self._silent[number] for number, _ in ready if number in self._silent]
+            for visit in sorted(spoken, key=lambda v: places[v.peer]):
+                if _has_spoken(visit.socket):
+                    events.unregister(visit.socket)
+                    del self._silent[visit.socket.fileno()]
+                    return visit
+                self._drop(visit)
+        return None
 
     def _add(self, visit: Visit) -> None:
         with self._lock:
-            self._visits.add(visit)
+            self._visits[visit] = None
             strangers = [v for v in self._visits if not v.known]
             if len(strangers) > STRANGERS:
                 most = Counter(v.peer for v in strangers).most_common(1)[0][0]
-                self._drop(min((v for v in strangers if v.peer == most), key=lambda v: v.until))
+                self._drop(next(v for v in strangers if v.peer == most))
 
     def _drop(self, visit: Visit) -> None:
-        self._visits.discard(visit)
-        visit.end()
+        self._visits.pop(visit, None)
+        if self._silent.get(number := visit.socket.fileno()) is visit:
+            del self._silent[number]
+            visit.socket.close()  # nobody else has it
+        else:
+            visit.end()
 
     def leave(self, visit: Visit) -> None:
         """It is closed."""
         with self._lock:
-            self._visits.discard(visit)
+            self._visits.pop(visit, None)
 
     def visit(self, address: tuple[Any, ...] | None) -> Visit | None:
         """The connection from an address (host, port); None if it is no longer there."""
@@ -161,6 +225,9 @@ class Door(socket.socket):
     def close(self) -> None:
         self._closed_now.set()
         super().close()
+        with self._lock:
+            for visit in list(self._silent.values()):
+                self._drop(visit)
 
     def _sweep(self) -> None:
         while not self._closed_now.wait(SWEEP_S):
@@ -168,3 +235,11 @@ class Door(socket.socket):
             with self._lock:
                 for visit in [v for v in self._visits if v.until <= now]:
                     self._drop(visit)
+
+
+def _has_spoken(connection: socket.socket) -> bool:
+    """Whether there is something to read; not its end."""
+    try:
+        return bool(connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
+    except OSError:
+        return False

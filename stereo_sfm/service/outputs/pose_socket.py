@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.messages import PoseUpdate, ServiceMessage, Started
 from stereo_sfm.service.outputs.access import Access, TooManyAttempts, access
-from stereo_sfm.service.outputs.door import UNREAD_S, Door, Visit
+from stereo_sfm.service.outputs.door import BACKLOG, UNREAD_S, Door, Visit
 from stereo_sfm.service.outputs.pose_message import FORMATS, pose_message
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.publisher import ServiceClient
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 log = logging.getLogger("stereo_sfm")
 
 MOST_CLIENTS = 32
-BACKLOG = 128  # connections that the system holds until they are accepted
 BUFFER_BYTES = 1 << 16  # of the system for one client: a slow one is not far behind
 HTTP = " HTTP/1.0", " HTTP/1.1"  # how the first line of a request ends
 HANDSHAKE_BYTES = 4200
@@ -152,7 +151,7 @@ class PoseSocket:
 
     def open(self, service: ServiceClient) -> None:
         """Listen."""
-        self._server = Door.of(self._place.listen(), MOST_CLIENTS)
+        self._server = Door.of(self._place.listen(), MOST_CLIENTS, speak=bool(self._rules.token))
         threading.Thread(target=self._accept, args=(self._server,), daemon=True).start()
 
     def put(self, message: ServiceMessage) -> None:

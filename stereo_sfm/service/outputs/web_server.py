@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.outputs.access import Access, is_loopback
-from stereo_sfm.service.outputs.door import IDLE_S, Door
+from stereo_sfm.service.outputs.door import BACKLOG, IDLE_S, Door
 from stereo_sfm.service.outputs.settings import SecurityConfig
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from stereo_sfm.service.outputs.guard import Guard
 
 END_S = 0.8
+HANDED_OVER = 16  # connections that the door gives it before it looks after the others again
 MESSAGE_BYTES = 1 << 16  # of a WebSocket, from a client
 
 
@@ -52,7 +53,8 @@ class WebServer:
 
         family = socket.AF_INET6 if ":" in self._address else socket.AF_INET
         try:
-            self.door = Door.of(socket.create_server((self._address, self._port), family=family))
+            listening = socket.create_server((self._address, self._port), family=family, backlog=BACKLOG)
+            self.door = Door.of(listening, speak=True)
         except (OSError, UnicodeError) as error:
             why = getattr(error, "strerror", None) or error
             raise StereoSfmError(f"{self._name}: cannot listen on {self._address}:{self._port}: {why}") from None
@@ -62,6 +64,7 @@ class WebServer:
         config = uvicorn.Config(
             guard,
             loop="asyncio",  # it calls the door's `accept`
+            backlog=HANDED_OVER,
             http=_protocol(),
             ws="websockets-sansio",
             ws_max_size=MESSAGE_BYTES,
