@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.outputs.access import (
     MOST_PEERS,
+    MOST_REFUSED,
+    WRONG_A_SECOND,
     WRONG_AT_ONCE,
     Access,
     Attempts,
@@ -107,6 +110,46 @@ def test_who_guesses_waits_and_nobody_else() -> None:
     clock.now += 2.0
     assert rules.allows(TOKEN, "mallory")
     assert not rules.allows("\ud800", "operator") and not rules.allows("é", "operator")  # any text at all
+
+
+def test_a_client_that_repeats_an_old_token_keeps_nobody_out() -> None:
+    clock = Clock()
+    rules, late = Access(TOKEN, None, Attempts(clock)), 0
+    for _ in range(600):
+        for old in ("a token of yesterday", "a token of the day before"):
+            with suppress(TooManyAttempts):
+                assert not rules.allows(old, "operator")
+        assert rules.allows(TOKEN, "operator")
+        clock.now += 0.5
+    for _ in range(20):
+        try:
+            rules.allows("a token of yesterday", "operator")
+        except TooManyAttempts:
+            late += 1
+    assert late >= 20 - WRONG_AT_ONCE  # who floods waits
+    assert rules.allows(TOKEN, "operator")
+
+
+def test_tokens_sent_twice_are_guessed_no_faster() -> None:
+    """Neither repeats nor old guesses buy another look at a token."""
+    clock, looks = Clock(), set[str]()
+    attempts = Attempts(clock)
+
+    def guess(text: str) -> None:
+        def right() -> bool:
+            looks.add(text)
+            return False
+
+        with suppress(TooManyAttempts):
+            attempts.check("mallory", right, text.encode())
+
+    for i in range(200):
+        for text in (f"guess {i}", f"guess {i}", f"guess {i - 1}", f"guess {i // 2}"):
+            guess(text)
+        clock.now += 0.5
+    assert len(looks) <= WRONG_AT_ONCE + 200 * 0.5 * WRONG_A_SECOND
+    (guesser,) = attempts._buckets.values()  # pyright: ignore[reportPrivateUsage]
+    assert len(guesser._refused) <= MOST_REFUSED  # pyright: ignore[reportPrivateUsage]
 
 
 def test_peers_that_guess_are_remembered_within_bounds() -> None:

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 LEAST_TOKEN = 16  # characters
 MOST_TOKEN = 4096
 WRONG_A_SECOND, WRONG_AT_ONCE = 0.5, 5  # wrong tokens of one peer before it has to wait
-MOST_PEERS = 1024  # whose wrong tokens are remembered
+MOST_PEERS = 1024  # whose wrong tokens are counted
+MOST_REFUSED = 8  # wrong tokens of one peer that are remembered
 LINK_S = 600.0  # that a link may wait for its log-in
 
 
@@ -58,29 +59,55 @@ class Bucket:
         return True
 
 
+class _Guesser:
+    """What one peer has sent wrongly. A token that it repeats is no other guess: it counts for itself."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._guesses = Bucket(WRONG_A_SECOND, WRONG_AT_ONCE, clock)
+        self._refused: OrderedDict[bytes, Bucket] = OrderedDict()  # by hash: nobody reads a token here
+
+    def has_to_wait(self, sent: bytes) -> bool:
+        """Whether this token is not looked at now."""
+        again = self._refused.get(sent)
+        return self._guesses.left < 1 if again is None else again.left < 1
+
+    def refuse(self, sent: bytes) -> None:
+        """It was wrong."""
+        (self._refused.get(sent) or self._guesses).take()
+        if sent not in self._refused:
+            self._refused[sent] = Bucket(WRONG_A_SECOND, WRONG_AT_ONCE, self._clock)
+            while len(self._refused) > MOST_REFUSED:
+                self._refused.popitem(last=False)
+
+
 class Attempts:
-    """Wrong tokens by peer: one that guesses makes itself wait, and no other."""
+    """Wrong tokens by peer: one that guesses makes itself wait, and no other.
+
+    A client that repeats an old token makes nobody wait but itself.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._buckets: OrderedDict[str, Bucket] = OrderedDict()
+        self._buckets: OrderedDict[str, _Guesser] = OrderedDict()
         self._lock = threading.Lock()
 
-    def check(self, peer: str, right: Callable[[], bool]) -> bool:
+    def check(self, peer: str, right: Callable[[], bool], sent: bytes = b"") -> bool:
         """Whether a token is right.
 
-        Args: peer, who sent it. right: compares it.
+        Args: peer, who sent it. right: compares it. sent: it.
 
         Raises:
             TooManyAttempts: the peer has to wait; its token is not looked at.
         """
+        name = hashlib.sha256(sent).digest()
         with self._lock:
-            bucket = self._buckets.get(peer)
-            if bucket is not None and bucket.left < 1:
+            guesser = self._buckets.get(peer)
+            if guesser is not None and guesser.has_to_wait(name):
                 raise TooManyAttempts("too many attempts: wait a moment")
             if right():
                 return True
-            self._buckets.setdefault(peer, Bucket(WRONG_A_SECOND, WRONG_AT_ONCE, self._clock)).take()
+            self._buckets.setdefault(peer, _Guesser(self._clock)).refuse(name)
             self._buckets.move_to_end(peer)
             while len(self._buckets) > MOST_PEERS:
                 self._buckets.popitem(last=False)
@@ -106,7 +133,7 @@ class Access:
         if not self.token or not token:  # who sends none does not guess
             return not self.token
         sent = token.encode("utf-8", "surrogatepass")
-        return self._attempts.check(peer, lambda: hmac.compare_digest(sent, self.token.encode()))
+        return self._attempts.check(peer, lambda: hmac.compare_digest(sent, self.token.encode()), sent)
 
 
 class Links:
