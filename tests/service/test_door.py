@@ -316,3 +316,31 @@ def test_guesses_at_a_port_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
         assert ask(TOKEN, "127.0.0.1") == 200  # somebody else
     finally:
         output.close()
+
+
+def test_a_session_is_of_no_use_to_another_peer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A browser sends a cookie of 127.0.0.1 to every port there: others of this computer can have it."""
+    service = FakeService()
+    output = PageOutput("127.0.0.1", 0, 4.0, Access(TOKEN))
+    output.open(service)
+    web = output._web.door  # pyright: ignore[reportPrivateUsage]
+    assert web is not None
+    monkeypatch.setattr(web, "_peer_of", _by_source)
+    try:
+
+        def ask(path: str, source: str, body: str | None = None, cookie: str = "") -> tuple[int, str]:
+            connection = http.client.HTTPConnection("127.0.0.1", output.port, 5, source_address=(source, 0))
+            more = {"Content-Type": "application/json", "X-Stereo-Sfm": "1", "Cookie": cookie}
+            connection.request("GET" if body is None else "POST", path, body, more)
+            answer = connection.getresponse()
+            connection.close()
+            return answer.status, answer.getheader("set-cookie", "").partition(";")[0]
+
+        status, cookie = ask("/login", "127.0.0.1", json.dumps({"token": TOKEN}))
+        assert status == 200
+        for path, body in (("/api/map", None), ("/api/command/reset", "{}")):
+            assert ask(path, "127.0.0.9", body, cookie)[0] == 401 and not service.calls
+        for path, body in (("/api/map", None), ("/api/command/reset", "{}")):
+            assert ask(path, "127.0.0.1", body, cookie)[0] == 200
+    finally:
+        output.close()

@@ -67,7 +67,7 @@ class Page:
         self._state, self._service, self._rules, self._guard = state, service, rules, guard
         self._surfaces = SurfacePictures(Path(surface)) if surface else None
         self._links = Links(rules.token) if rules.token else None
-        self._sessions: dict[str, float] = {}  # id -> until when
+        self._sessions: dict[str, tuple[str, float]] = {}  # id -> whose, until when
         self._commands = Bucket(5, 20)
         self._viewers = 0
         self._verdicts = Verdicts(self._folder_of)
@@ -104,25 +104,28 @@ class Page:
         return guarded
 
     def _has_session(self, request: Request) -> bool:
-        return self._sessions.get(request.cookies.get(COOKIE, ""), 0.0) > time.monotonic()
+        """Of this peer: browsers send the cookie to every port of a host, and so to other users of this computer."""
+        peer, until = self._sessions.get(request.cookies.get(COOKIE, ""), ("", 0.0))
+        return until > time.monotonic() and peer == self._guard.peer(request.scope)
 
     async def _login(self, request: Request) -> Response:
         """A session for the token, or for the code of a link."""
+        peer = self._guard.peer(request.scope)
         try:
             values = await _object(request)
             sent = str(values.get("token", ""))
             by_link = self._links is not None and self._links.take(sent)
-            if not by_link and not self._rules.allows(sent, self._guard.peer(request.scope)):
+            if not by_link and not self._rules.allows(sent, peer):
                 return refusal(401, "this is not the token")
         except TooManyAttempts as error:
             return refusal(429, str(error))
         except StereoSfmError as error:
             return refusal(400, str(error))
         now = time.monotonic()
-        alive = {key: until for key, until in self._sessions.items() if until > now}
+        alive = {key: session for key, session in self._sessions.items() if session[1] > now}
         self._sessions = dict(list(alive.items())[1 - MOST_SESSIONS :])
         key = secrets.token_urlsafe(32)
-        self._sessions[key] = now + SESSION_S
+        self._sessions[key] = peer, now + SESSION_S
         response = JSONResponse({"ok": True})
         secure = self._rules.tls is not None
         response.set_cookie(COOKIE, key, int(SESSION_S), httponly=True, samesite="strict", secure=secure)
