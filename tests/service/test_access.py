@@ -87,6 +87,24 @@ def test_a_link_allows_one_log_in_in_ten_minutes() -> None:
         assert not links.take(wrong)
 
 
+def test_a_link_that_was_used_stays_so_after_a_restart(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    clock, folder = Clock(), tmp_path / "state" / "used"
+    links = [Links(TOKEN, clock, folder) for _ in range(3)]
+    code, waiting = links[0].new(), links[0].new()
+    assert links[0].take(code) and not links[1].take(code)
+    assert links[1].take(waiting) and not links[2].take(waiting)  # printed before the restart, used after it
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700 and len(list(folder.iterdir())) == 2
+    assert not any(part in file.name for file in folder.iterdir() for part in (code, waiting, TOKEN))
+    clock.now += 601
+    late = links[2].new()
+    assert links[2].take(late) and len(list(folder.iterdir())) == 1  # what is over needs no file
+    clock.now -= 500  # set back
+    assert not links[1].take(late)
+    full = Links(TOKEN, clock, Path("/proc/nowhere"))
+    code = full.new()
+    assert full.take(code) and not full.take(code) and "may log in again after a restart" in caplog.text
+
+
 def test_the_link_to_the_page_has_a_code(tmp_path: Path) -> None:
     file = tmp_path / "token"
     file.write_text(TOKEN)

@@ -618,6 +618,10 @@ def test_a_link_logs_in_once() -> None:
         assert [answer[0] for answer in answers] == [200, 401]
         cookie = answers[0][2]["set-cookie"].split(";")[0]
         assert _ask(output, "GET", "/api/map", None, {"Cookie": cookie})[0] == 200
+        unused = json.dumps({"token": Links(TOKEN).new()})
+    with _serving(rules=Access(TOKEN)) as output:  # the page was started again
+        answers = [_ask(output, "POST", "/login", sent, COMMAND)[0] for sent in (code, unused, unused)]
+        assert answers == [401, 200, 401]
 
 
 def test_a_port_that_is_taken_and_one_open_to_all_are_one_line() -> None:

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import hmac
 import ipaddress
+import logging
 import os
 import secrets
 import ssl
@@ -24,6 +25,8 @@ from stereo_sfm.service.outputs.settings import SecurityConfig
 
 if TYPE_CHECKING:
     from stereo_sfm.service.config import RobotConfig
+
+log = logging.getLogger("stereo_sfm")
 
 LEAST_TOKEN = 16  # characters
 MOST_TOKEN = 4096
@@ -139,9 +142,12 @@ class Access:
 class Links:
     """Codes in links to the page, made from the token: each allows one log-in, within ten minutes."""
 
-    def __init__(self, token: str, clock: Callable[[], float] = time.time) -> None:
-        """Args: clock, Unix time: another process makes the codes."""
-        self._key, self._clock = token.encode(), clock
+    def __init__(self, token: str, clock: Callable[[], float] = time.time, kept: Path | None = None) -> None:
+        """Args:
+        clock: Unix time: another process makes the codes.
+        kept: folder that remembers those used after this process; without it, they are remembered here only.
+        """
+        self._key, self._clock, self._kept = token.encode(), clock, kept
         self._used: dict[str, float] = {}  # until when they would be valid
 
     def new(self) -> str:
@@ -159,10 +165,29 @@ class Links:
             return False
         now, until = self._clock(), float(int(parts[1], 16))
         self._used = {name: end for name, end in self._used.items() if end > now}
-        if until <= now or parts[2] in self._used:
+        if until <= now or parts[2] in self._used or self._was_used(signature, until):
             return False
         self._used[parts[2]] = until
         return True
+
+    def _was_used(self, name: str, until: float) -> bool:
+        """Whether a file says so; else one does from now on, where it can be written."""
+        if self._kept is None:
+            return False
+        try:
+            self._kept.mkdir(parents=True, exist_ok=True, mode=0o700)
+            (self._kept / name).touch(0o600, exist_ok=False)
+            os.utime(self._kept / name, (until, until))
+        except FileExistsError:
+            return True
+        except OSError as error:  # a full disk must not keep the operator out
+            log.warning("a used link may log in again after a restart: %s: %s", self._kept, error.strerror)
+            return False
+        with contextlib.suppress(OSError):
+            for file in self._kept.iterdir():
+                if file.stat().st_mtime <= self._clock():
+                    file.unlink()
+        return False
 
     def _signature(self, until: str, name: str) -> str:
         text = f"once-{until}-{name}".encode("utf-8", "surrogatepass")
@@ -208,11 +233,16 @@ def token_file(security: SecurityConfig) -> Path:
     """Where the token is: as configured, else in the folder for the state of the service's user."""
     if security.token_file:
         return Path(security.token_file)
-    try:
-        state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    except RuntimeError:
-        raise StereoSfmError("this user has no home folder: set security.token_file") from None
-    return state / "stereo-sfm" / "token"
+    folder = _state()
+    if folder is None:
+        raise StereoSfmError("this user has no home folder: set security.token_file")
+    return folder / "token"
+
+
+def used_links() -> Path | None:
+    """Where `Links` may remember the codes that were used; None: this user has no home folder."""
+    folder = _state()
+    return None if folder is None else folder / "used-links"
 
 
 def page_link(config: RobotConfig) -> str:
@@ -226,6 +256,13 @@ def page_link(config: RobotConfig) -> str:
     host = f"[{host}]" if ":" in host else host
     code = f"#{Links(rules.token).new()}" if rules.token else ""
     return f"http{'s' if rules.tls is not None else ''}://{host}:{page.port}/{code}"
+
+
+def _state() -> Path | None:
+    """The folder for the state of this user; None: it has no home folder."""
+    with contextlib.suppress(RuntimeError):
+        return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stereo-sfm"
+    return None
 
 
 def _make(path: Path) -> None:

@@ -22,7 +22,7 @@ from starlette.routing import Route, Router
 from starlette.types import ASGIApp
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.service.outputs.access import Access, Bucket, Links, TooManyAttempts
+from stereo_sfm.service.outputs.access import Access, Bucket, Links, TooManyAttempts, used_links
 from stereo_sfm.service.outputs.door import HANDSHAKE_S
 from stereo_sfm.service.outputs.guard import Guard, refusal
 from stereo_sfm.service.page import playback
@@ -66,7 +66,7 @@ class Page:
         """
         self._state, self._service, self._rules, self._guard = state, service, rules, guard
         self._surfaces = SurfacePictures(Path(surface)) if surface else None
-        self._links = Links(rules.token) if rules.token else None
+        self._links = Links(rules.token, kept=used_links()) if rules.token else None
         self._sessions: dict[str, tuple[str, float]] = {}  # id -> whose, until when
         self._commands = Bucket(5, 20)
         self._viewers = 0
