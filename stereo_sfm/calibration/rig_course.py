@@ -60,7 +60,9 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: F64
     """
     count, kinds = columns.shape
     columns = np.concatenate([columns, [w.turn for w in windows]], axis=1)
-    precision = np.diag(np.concatenate([prior, np.tile(BY_TURN, (3, 1))]).ravel() ** -2)
+    by_turn = BY_TURN.copy()
+    by_turn[[1, windows[0].across]] = BY_TURN[[windows[0].across, 1]]
+    precision = np.diag(np.concatenate([prior, np.tile(by_turn, (3, 1))]).ravel() ** -2)
     matrices = np.stack([w.information.matrix for w in windows])
     vectors = np.stack([w.information.vector for w in windows])
     axes = np.einsum("nk,ab->nakb", columns, np.eye(RIG_TERMS)).reshape(count, RIG_TERMS, -1)

@@ -33,7 +33,6 @@ STEPS = 4  # of Gauss-Newton: two that find what does not fit, two without it
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives, thousandths of a pixel
 NOISE_PX = 0.05, 5.0  # px, limits of the estimated noise of one coordinate: of exact data, of none that fit
 LENSES = slice(5, 8)  # focal ratio and decentering
-LENGTHENING = 1, *range(RIG_TERMS)[LENSES]  # terms that trade lengths with one another: rotation about y, and these
 # Prior standard deviations of the terms, radians, radians, ratio, radians: wide enough for a step of half a degree.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
@@ -87,8 +86,13 @@ class RigWindow:
     stamp_ns: int  # of the last keyframe
     information: RigInformation
     noise_px: float
-    length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
+    length: F64  # (8,) relative change of lengths by each of the `_lengthening` terms, per radian or ratio; others zero
     turn: F64  # (3,) radians from the first to the last keyframe
+
+    @property
+    def across(self) -> int:
+        """The term of the rotation that changes lengths: 1, about y, where one camera is beside the other."""
+        return int(abs(self.length[1]) >= abs(self.length[0]))
 
     def turned(self, change: F64) -> RigWindow:
         """If the rig's terms had been others, by `change` (8,)."""
@@ -137,23 +141,23 @@ def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWi
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
-    """(8,) relative change by LENGTHENING terms of the motion that the rig measures with points (N, 2), least squares.
+    """(8,) relative change by `_lengthening` terms of the motion that the rig measures with points (N, 2), least squares.
 
     Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2).
     """
     rho = inverse_distances(rig, uv_left, uv_right)
     used, out = np.isfinite(rho), np.zeros(RIG_TERMS)
-    for k, changed in zip(LENGTHENING, _lengthened(rig), strict=True):
+    for k, changed in _lengthening(rig).items():
         change = inverse_distances(changed, uv_left, uv_right) - rho
         out[k] = (rho * change)[used & np.isfinite(change)].sum()
     return -out / (DERIVATIVE * max(float((rho[used] ** 2).sum()), 1e-12))
 
 
 @functools.lru_cache(maxsize=1)
-def _lengthened(rig: Rig) -> tuple[Rig, ...]:
-    """The rig, which is the same for all windows of a run, with a little more of each of the LENGTHENING terms."""
-    steps = DERIVATIVE * np.eye(RIG_TERMS)
-    return tuple(with_terms(rig, steps[k]) for k in LENGTHENING)
+def _lengthening(rig: Rig) -> dict[int, Rig]:
+    """Terms that trade lengths with one another, rotation across the baseline and LENSES: the rig with more of each."""
+    across = int(np.argmin(np.abs(rig.left_T_right[:2, 3])))
+    return {k: with_terms(rig, DERIVATIVE * np.eye(RIG_TERMS)[k]) for k in (across, *range(RIG_TERMS)[LENSES])}
 
 
 def _problem(rig: Rig, keyframes: Sequence[SeenPoints]) -> _Problem | None:
@@ -182,11 +186,12 @@ def _shapes(camera: Camera, uv: F64) -> F64:
     Magnification, the first radial order, a shift and the second orders: they bend the flow of a turning camera, which
     is similar to an error of disparity.
     """
-    x, y = 2 * uv[..., 0] / camera.width - 1, (2 * uv[..., 1] - camera.height) / camera.width
+    side = max(camera.width, camera.height)
+    x, y = 2 * uv[..., 0] / side - camera.width / side, (2 * uv[..., 1] - camera.height) / side
     r2, one, zero = x * x + y * y, np.ones_like(x), np.zeros_like(x)
     u = [x, x * r2, one, zero, x * x, x * y, y * y, zero, zero, zero]
     v = [y, y * r2, zero, one, zero, zero, zero, x * x, x * y, y * y]
-    return np.asarray(0.5 * camera.width * np.nan_to_num(np.stack([np.stack(u, -1), np.stack(v, -1)], -2)), float)
+    return np.asarray(0.5 * side * np.nan_to_num(np.stack([np.stack(u, -1), np.stack(v, -1)], -2)), float)
 
 
 def _equations(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> tuple[Eliminated, float]:

@@ -92,7 +92,7 @@ class SelfCalibration:
         self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
         self._turn: F64 = np.zeros(3)  # that the tracker noticed
         self._turned_kf_id = -1  # first keyframe since; -1: the rig has been corrected
-        half_width = 0.5 * rig.left.width
+        half_width = 0.5 * max(rig.left.width, rig.left.height)
         turn, roll = 1 / rig.left.fx, 2 / half_width
         decentering = roll * rig.left.fx / half_width
         self._of_pixel = np.array([turn, turn, roll, np.inf, np.inf, roll, decentering, decentering])
@@ -107,7 +107,7 @@ class SelfCalibration:
         turned = self._sudden_turn(keyframe, seen)
         if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
-        moved = not self._keyframes or _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width)
+        moved = not self._keyframes or _moved(self._keyframes[-1], seen, MIN_MOTION * max(self._rig.left.size))
         if moved:
             self._keyframes.append(seen)
         if not moved or turned is not None or self._turned_kf_id >= 0:
@@ -276,18 +276,20 @@ class SelfCalibration:
         self._corrected |= change.selected
         self._sigma = change.sigma
         self._revised_ns = self._stamp_ns
-        text = _text(change.value, change.sigma)
+        values, sigmas = SCALES * change.value, SCALES * change.sigma
+        changed = np.flatnonzero(change.value)
+        text = "; ".join(f"{NAMES[i]} {values[i]:+.3f} +- {sigmas[i]:.3f} {UNITS[i]}" for i in changed)
         return Revision(self.terms.copy(), change.covariance, since_kf_id, why, text, on_the_way)
 
     def _basis(self, windows: Sequence[RigWindow]) -> F64:
-        """(8, 8) from the terms to those that are chosen: instead of the rotation about y, the one that changes lengths
+        """(8, 8) from the terms to those that are chosen: instead of the rotation `across`, the one that changes lengths
         as much as it and the terms of lenses together, so that they stay where it is held. With a rolling shutter
         motion can mimic it (`calib.choice`), and the terms are chosen as they are.
         """
         basis = np.eye(RIG_TERMS)
-        length = np.mean([w.length for w in windows], axis=0)
-        if not self._rolling and abs(length[1]) > 1e-9:
-            basis[1, LENSES] = length[LENSES] / length[1]
+        length, across = np.mean([w.length for w in windows], axis=0), windows[0].across
+        if not self._rolling and abs(length[across]) > 1e-9:
+            basis[across, LENSES] = length[LENSES] / length[across]
         return basis
 
     def _drift(self, windows: Sequence[RigWindow]) -> _Drift | None:
@@ -327,11 +329,3 @@ def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:
     if len(at) < MAX_COMMON * len(a.point_ids):
         return True
     return bool(np.median(np.linalg.norm(a.uv_left[at] - b.uv_left[of], axis=1)) > min_px)
-
-
-def _text(change: F64, sigma: F64) -> str:
-    parts = [
-        f"{NAMES[i]} {SCALES[i] * change[i]:+.3f} +- {SCALES[i] * sigma[i]:.3f} {UNITS[i]}"
-        for i in np.flatnonzero(change)
-    ]
-    return "; ".join(parts)

@@ -111,6 +111,32 @@ def test_a_decentered_lens_is_found(kind: int) -> None:
     assert np.abs(np.rad2deg(estimator.terms[:3])).max() < 0.015
 
 
+def test_a_pair_one_above_the_other_is_corrected_alike() -> None:
+    """The same keyframes, with images turned by a quarter: the terms of the right camera are turned, too."""
+    believed, terms = RIGS["pinhole"], np.zeros(RIG_TERMS)
+    terms[:3], terms[6] = np.deg2rad([-0.02, 0.05, -0.04]), 0.006
+    true = with_terms(believed, terms)
+    assert believed.right is not None
+    quarter = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    left, right = (
+        replace(c, width=c.height, height=c.width, fx=c.fy, fy=c.fx, cx=c.height - 1 - c.cy, cy=c.cx)
+        for c in (believed.left, believed.right)
+    )
+    above = replace(believed, left=left, right=right, left_T_right=quarter @ believed.left_T_right @ quarter.T)
+    estimator, estimator_above = SelfCalibration(believed), SelfCalibration(above)
+    found: list[tuple[Revision | None, Revision | None]] = []
+    for k in keyframes([true] * 64, believed, 0):
+        uv_left, uv_right = (np.stack([left.width - 1 - uv[:, 1], uv[:, 0]], 1) for uv in (k.uv_left, k.uv_right))
+        pose = k.odom_T_cam @ quarter.T
+        k_above = replace(k, odom_T_cam=pose, uv_left=uv_left, uv_right=uv_right)
+        found.append((estimator.add(k), estimator_above.add(k_above)))
+    assert any(a for a, _ in found) and all((a is None) == (b is None) for a, b in found)
+    terms, above_terms = estimator.terms, estimator_above.terms
+    assert np.abs(terms[[0, 1, 2, 6]]).min() > 0
+    np.testing.assert_allclose(above_terms[:3], quarter[:3, :3] @ terms[:3], atol=1e-6)
+    np.testing.assert_allclose(above_terms[3:], [*terms[3:6], terms[7], -terms[6]], atol=1e-6)
+
+
 @pytest.mark.parametrize("name", RIGS)
 def test_points_tracked_with_a_wrong_rig_are_forgotten(name: str) -> None:
     """They agree with it by a twentieth of its error, and so would the correction."""
