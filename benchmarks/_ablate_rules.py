@@ -99,7 +99,7 @@ RULES = (
         "self._optimise(tracks, expected, by, expected)",
         "self._optimise(tracks, expected, by)",
     ),
-    _rule("prior in the refit", SOLVER, "first.inlier & static, expected)", "first.inlier & static)"),
+    _rule("prior in the refit", SOLVER, "agree, expected)\n", "agree)\n"),
     _rule("start at rest", SOLVER, "if best.inliers < 0.5 * np.count_nonzero(static):", "if False:"),
     _rule("noise is learned", SOLVER, "self._learn_noise(tracks, solution, seconds)\n        if", "if"),
     _rule(

@@ -124,6 +124,25 @@ def test_points_that_agree_with_both_motions_are_no_evidence_of_rest(seed: int) 
     assert not solution.moving.any() and solution.inlier.mean() > 0.9
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_start_in_traffic_is_no_rest(seed: int) -> None:
+    """A car drives, points are far, another comes towards it: that the camera rests is a prediction without evidence."""
+    rng, driven = np.random.default_rng(seed), se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.002, 0.0]))
+    tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < 130)
+    other = np.arange(130) >= 115
+    depth = np.where(other, rng.uniform(12.0, 14.0, 130), rng.uniform(13.0, 70.0, 130))
+    at = np.where(other[:, None], rng.uniform([-0.3, 0.1], [-0.2, 0.2], (130, 2)), rng.uniform(-0.4, 0.4, (130, 2)))
+    before = depth[:, None] * np.column_stack([at, np.ones(130)])
+    now = se3.transform(se3.inverse(driven), before)
+    now[other, 2] -= 0.6
+    put(rng, tracks, before, now, 0.15)
+    tracks.age, tracks.variance = np.zeros(130, np.int32), np.full(130, 0.004**2)
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    solution = solver.solve(tracks, ExpectedMotion(np.eye(4), np.zeros(6), 0.045), np.eye(4), before=130)
+    assert float(se3.extent(se3.inverse(driven) @ solution.pose)[0]) < 0.2
+    assert solution.inlier[~other].mean() > 0.8 and not solution.moving[~other].any()
+
+
 def test_in_the_first_images_the_motion_of_far_points_is_tried() -> None:
     """Nobody was followed for long yet, and most points are on somebody near who walks and swings his arms."""
     turned, count, right = se3.exp(np.array([0.002, 0.0, 0.003, 0.0, 0.012, 0.0])), 75, 0

@@ -198,7 +198,8 @@ class FramePoseSolver:
         by_known = self._optimise(tracks, expected.to(best.pose), known)
         if by_known.inlier[known].sum() < AGREEING_SHARE * known.sum():
             return None
-        moved = by_known.covariance @ self._by_common_rho(tracks.keep(known), by_known)
+        pose, velocity, _, *others = self._at(by_known, tracks.keep(known))
+        moved = by_known.covariance @ pose_solver.by_common_rho(pose, velocity, *others)
         spread = by_known.covariance + np.diag(drift) + self._rho_sigma**2 * np.outer(moved, moved)
         off = np.zeros(len(tracks), bool)
         off[suspected] = self.influence(tracks.keep(suspected), replace(by_known, covariance=spread))[1] > WRONG_SIGMAS
@@ -362,7 +363,9 @@ class FramePoseSolver:
         """The pose by all inliers of a pose that the points `by` gave; None if most of those are outliers."""
         if (first.inlier & by).sum() < max(self._config.min_features, 0.5 * by.sum()):
             return None
-        return self._optimise(tracks, expected.to(first.pose), first.inlier & static, expected)
+        agree = first.inlier & static
+        fitted = self._optimise(tracks, expected.to(first.pose), agree, expected)
+        return fitted if fitted.inlier[agree].sum() >= 0.5 * agree.sum() else first  # the prediction is wrong
 
     def crowded(self, static_points: int) -> bool:
         """Whether objects that move hide so much of an open view that new points are needed in every image."""
@@ -445,11 +448,6 @@ class FramePoseSolver:
         """`pose_solver.shift_chi2` of some points (N,) and the other static ones."""
         others = self._seen(tracks.keep(~tracks.moving & ~points))
         return pose_solver.shift_chi2(*self._at(s, tracks.keep(points)), others, drift, self._rho_sigma)
-
-    def _by_common_rho(self, tracks: Tracks, s: PoseSolution) -> F64:
-        """`pose_solver.by_common_rho` of some points."""
-        pose, velocity, _, *others = self._at(s, tracks)
-        return pose_solver.by_common_rho(pose, velocity, *others)
 
     @property
     def _rho_sigma(self) -> float:
