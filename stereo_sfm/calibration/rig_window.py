@@ -141,7 +141,7 @@ def solve_window(rig: Rig, keyframes: Sequence[SeenPoints], terms: F64) -> RigWi
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
-    """(8,) relative change by `_lengthening` terms of the motion that the rig measures with points (N, 2), least squares.
+    """(8,) relative change by lengthening terms of the motion that the rig measures with points (N, 2): least squares.
 
     Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2).
     """

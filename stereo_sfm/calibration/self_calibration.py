@@ -282,8 +282,8 @@ class SelfCalibration:
         return Revision(self.terms.copy(), change.covariance, since_kf_id, why, text, on_the_way)
 
     def _basis(self, windows: Sequence[RigWindow]) -> F64:
-        """(8, 8) from the terms to those that are chosen: instead of the rotation `across`, the one that changes lengths
-        as much as it and the terms of lenses together, so that they stay where it is held. With a rolling shutter
+        """(8, 8) from the terms to those that are chosen: instead of the rotation `across`, one that changes lengths as
+        much as it and the terms of lenses together, so that they stay where it is held. With a rolling shutter
         motion can mimic it (`calib.choice`), and the terms are chosen as they are.
         """
         basis = np.eye(RIG_TERMS)

@@ -126,7 +126,7 @@ def test_points_that_agree_with_both_motions_are_no_evidence_of_rest(seed: int) 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_start_in_traffic_is_no_rest(seed: int) -> None:
-    """A car drives, points are far, another comes towards it: that the camera rests is a prediction without evidence."""
+    """A car drives, points are far, another comes towards it: rest is a prediction without evidence."""
     rng, driven = np.random.default_rng(seed), se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.002, 0.0]))
     tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < 130)
     other = np.arange(130) >= 115
