@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 
+import cv2
 import numpy as np
 
 from stereo_sfm.calib.mistakes import mistake
@@ -35,6 +36,11 @@ ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with al
 READ_OTHERWISE = "name their topics so ('image_rect' or 'image_raw'), or give their calibration with '--rig FILE'"
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
+EDGE = 8  # grey levels between neighbours in a row, where two cameras' images are compared
+MIN_EDGES = 100  # pixels, with which the images tell one camera from two
+SAME = 0.9  # of them: two sensors' noise leaves fewer equal even without disparity, as their noise would have to be
+# below a tenth of a grey level (shot noise of 4 million electrons); real pairs have less than 0.07
+ONE_CAMERA = "left and right show the images of one camera: give each side its own folder, file or topic"
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +66,19 @@ def check_start(
         other_reading: of the source, asked if they do not fit.
     """
     seen: list[StereoImage] = []
-    cameras = _Cameras(rig)
+    cameras, alike = _Cameras(rig), 0
     for number, image in enumerate(islice(images, LOOKED_AT)):
         seen.append(image)
-        if number in CHOSEN and cameras.fit(image):
+        if number in CHOSEN and of_one_camera(image):
+            alike += 1
+        elif number in CHOSEN and cameras.fit(image):
             return StartFinding()
-    light = exposure([seen[k].left for k in CHOSEN if k < len(seen)])
+    chosen = [k for k in CHOSEN if k < len(seen)]
+    if alike and alike == len(chosen):
+        return StartFinding(ONE_CAMERA, shown=True)
+    light = exposure([seen[k].left for k in chosen])
     if light or not cameras.judged:
         return StartFinding(light)
-    chosen = [k for k in CHOSEN if k < len(seen)]
     other = other_reading()
     if other is not None and _confirmed(Fit(*other, np.zeros(0)), seen, chosen):
         return StartFinding(*other, shown=True, advice=READ_OTHERWISE)
@@ -128,6 +138,16 @@ class _Cameras:
         rows_fit = len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE
         self.rows_fit |= rows_fit
         return rows_fit and other_lens(self._rig, [window]) is None
+
+
+def of_one_camera(image: StereoImage) -> bool:
+    """Whether both sides are the same image, by the pixels at edges; False where they show nothing."""
+    if image.right is None or image.left.shape != image.right.shape:
+        return False
+    left, right = image.left[::4], image.right[::4]  # enough rows
+    edges = cv2.absdiff(left[:, 1:], left[:, :-1]) >= EDGE
+    same = (left[:, 1:] == right[:, 1:])[edges]
+    return len(same) >= MIN_EDGES and float(same.mean()) >= SAME and not exposure([image.left])
 
 
 def exposure(images: Sequence[U8]) -> str:

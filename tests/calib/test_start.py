@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -86,6 +87,37 @@ def test_good_images_give_no_diagnosis(images: tuple[s.Rig, list[s.StereoImage]]
     assert check_start(*images).text == ""
 
 
+def test_one_camera_for_both_sides_is_named_and_not_corrected(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, good = images
+    for seen in (good, good[:1]):
+        found = check_start(rig, [replace(image, right=image.left.copy()) for image in seen])
+        assert found.text.startswith("left and right show the images of one camera")
+        assert found.shown and found.rig is None and found.shift == 0
+    assert check_start(rig, [replace(good[0], right=good[0].left), *good[1:]]).text == ""  # a slip of the first pair
+
+
+def test_two_cameras_with_the_same_view_are_not_one(data_root: Path) -> None:
+    """So far away that no disparity is left, both with noise of half a grey level: less than sensors have."""
+    with s.open_source(data_root / "kitti") as source:
+        rig, good = source.rig, list(islice(source, 13))
+    rng = np.random.default_rng(4)
+
+    def noisy(image: U8) -> U8:
+        return np.clip(np.round(image + rng.normal(0, 0.5, image.shape)), 0, 255).astype(np.uint8)
+
+    assert check_start(rig, [replace(i, left=noisy(i.left), right=noisy(i.left)) for i in good]).text == ""
+
+
+@pytest.mark.parametrize(("level", "message"), [(0, "nearly black"), (90, "no contrast")])
+def test_a_clock_in_both_images_of_a_dark_or_blank_scene(
+    images: tuple[s.Rig, list[s.StereoImage]], level: int, message: str
+) -> None:
+    rig, good = images
+    blank = np.full_like(good[0].left, level)
+    cv2.putText(blank, "12:30", (20, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.0, 255, 2)
+    assert message in check_start(rig, [replace(image, left=blank, right=blank.copy()) for image in good]).text
+
+
 @pytest.fixture(scope="module", params=["kitti", "euroc_mh01", "store_walk"])
 def pair(request: pytest.FixtureRequest, data_root: Path) -> tuple[s.Rig, list[s.StereoImage]]:
     """A narrow rectified lens, a distorted one and a fisheye, each moving."""
@@ -130,6 +162,12 @@ def test_few_corners_with_matches_are_enough(data_root: Path) -> None:
     found = check_start(wrong(rig, rows=-6.0), few)
     assert found.rig is not None and found.shown and "6.0 px" in found.text
     assert check_start(rig, few).rig is None
+
+
+def test_one_real_camera_for_both_sides(pair: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, images = pair
+    found = check_start(rig, [replace(image, right=image.left) for image in images])
+    assert "the images of one camera" in found.text and found.shown and found.rig is None
 
 
 def test_small_errors_and_right_calibrations_stay(pair: tuple[s.Rig, list[s.StereoImage]]) -> None:
