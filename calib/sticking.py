@@ -8,6 +8,7 @@ looks the same in nearly all of them belongs to the camera.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
@@ -41,6 +42,7 @@ GAP_PX = 3  # between a part and its surroundings: windows that show both
 SAME_AROUND = 0.4  # of the windows around a part; as many look the same by chance and texture
 MIN_LEFT = 0.3  # of the image, where a tracked window shows nothing that sticks: with less, nothing can be masked
 TRACKED_PX = 7  # half of a tracked window, in the half-size image
+REPEATED = 3  # images of a side that are equal to the last bit, which sensor noise does not allow
 MASK = "'stereo-sfm mask SOURCE -o mask.png' writes a mask for all its recordings"
 
 
@@ -77,11 +79,17 @@ def sticking(images: Iterable[StereoImage]) -> list[Bool]:
 
 
 def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
-    """What the start check found of a calibration, with what sticks to these images; its rig has masks of that.
+    """What the start check found of a calibration, with what sticks to these images; its rig has masks of that. Nothing
+    else counts if one camera stands still.
 
     Raises:
         StereoSfmError: of the images.
     """
+    first, images = itertools.tee(images)
+    side = still_side(first)
+    if side:
+        other = "right" if side == "left" else "left"
+        return StartFinding(f"the {side} camera repeats one image while the {other} one moves: check it", shown=True)
     parts = sticking(images)
     if not parts:
         return finding
@@ -99,6 +107,28 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
         text = f"{finding.text}; and {text}"
         return replace(finding, text=text, rig=corrected or finding.rig, shown=True, masked=masked)
     return replace(finding, text=text, shown=True, advice=MASK, masked=masked)
+
+
+def still_side(images: Iterable[StereoImage]) -> str:
+    """Which camera, "left" or "right", repeats one image while the other's view changes; "" if neither does.
+
+    Args:
+        images: of the same cameras, in order; no more are read than needed.
+    """
+    begin: list[U8] = []
+    for number, image in enumerate(images, 1):
+        if image.right is None:
+            return ""
+        views = [image.left, image.right]
+        begin = begin or views
+        same = [np.array_equal(a, b) for a, b in zip(begin, views, strict=True)]
+        if number > 1 and same[0] == same[1]:
+            return ""
+        if number >= REPEATED and not exposure([views[same.index(True)]]):
+            old, new = (moments(one[same.index(False)]) for one in (begin, views))
+            if _view_changes(*old.compared(new, STRONG)):
+                return ("left", "right")[same.index(True)]
+    return ""
 
 
 def without_sticking(rig: Rig, parts: Sequence[Bool]) -> Rig | None:

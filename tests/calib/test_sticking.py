@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
-from stereo_sfm.calib.sticking import positions, sticking
+from stereo_sfm.calib.sticking import positions, sticking, still_side
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.start_checked import StartCheckedSource
+from stereo_sfm.geometry import se3
 from stereo_sfm.types import U8
 
 
@@ -85,19 +86,48 @@ def test_a_run_has_the_mask_and_says_so(data_root: Path) -> None:
         assert (mask is not None and 0.7 < mask.mean() < 0.99) if count == 300 else not found.rig  # exit code 4
 
 
+def passed(image: U8, k: int) -> U8:
+    """The k-th image of a camera at rest, with noise and somebody who walks past."""
+    rng = np.random.default_rng(k)
+    out = np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+    at = image.shape[1] * k // 10
+    out[:, at : at + image.shape[1] // 10] = rng.integers(0, 255, out[:, at : at + image.shape[1] // 10].shape)
+    return out
+
+
 def test_good_images_and_a_camera_at_rest_are_left_alone(images: list[s.StereoImage]) -> None:
     good, read = images, iter(images)
     assert sticking(read) == [] and list(read)  # a few are enough
-    rng = np.random.default_rng(2)
-
-    def noisy(image: U8, k: int) -> U8:  # at rest, with somebody who walks past
-        out = np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
-        at = image.shape[1] * k // 10
-        out[:, at : at + image.shape[1] // 10] = rng.integers(0, 255, out[:, at : at + image.shape[1] // 10].shape)
-        return out
-
-    rest = [replace(good[0], left=noisy(good[0].left, k), right=None) for k in range(8)]
+    rest = [replace(good[0], left=passed(good[0].left, k), right=None) for k in range(8)]
     assert sticking(rest) == []
+
+
+def test_a_camera_that_stands_still_beside_one_that_moves(images: list[s.StereoImage]) -> None:
+    first, read = images[0], iter(images)
+    assert still_side(read) == "" and len(list(read)) == len(images) - 2  # two images that differ are enough
+    assert still_side(replace(image, left=first.left) for image in images) == "left"
+    assert first.right is not None
+    assert still_side(replace(image, right=first.right.copy()) for image in images) == "right"
+
+
+def test_a_run_says_that_a_camera_stands_still_and_corrects_nothing(data_root: Path) -> None:
+    with s.open_source(data_root / "kitti") as source:
+        rig, good = source.rig, list(source.at(positions(source.frame_count)))
+    stuck = [replace(image, right=good[0].right) for image in good]
+    turned = replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.array([0, 0, 0, 0.02, 0, 0])))
+    for given in (rig, turned):
+        with StartCheckedSource(MemorySource(given, stuck), correct=True) as checked:
+            found = checked.start_check
+        assert found is not None and found.shown and not found.rig  # exit code 4
+        assert "the right camera repeats one image while the left one moves" in found.line
+
+
+def test_a_camera_at_rest_or_in_the_dark_does_not_stand_still(images: list[s.StereoImage]) -> None:
+    first = images[0]
+    assert still_side([first] * 8) == ""
+    assert still_side(replace(first, left=passed(first.left, k)) for k in range(8)) == ""  # as video files keep a side
+    assert still_side(replace(image, right=np.zeros_like(image.left)) for image in images) == ""
+    assert still_side(replace(image, right=None) for image in images) == ""
 
 
 def test_positions_are_within_the_recording() -> None:
