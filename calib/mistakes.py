@@ -64,15 +64,18 @@ MISTAKES = (
 )
 
 
-def mistake(rig: Rig, pairs: Sequence[Pair]) -> tuple[str, bool]:
+def mistake(rig: Rig, pairs: Sequence[Pair], corrected: Rig | None = None) -> tuple[str, bool]:
     """What is wrong between these pairs and the calibration, "" if nothing is found, and whether the images show it.
 
     Args:
         rig: two cameras. pairs: left and right images, one pair or more.
+        corrected: another explanation, which a mistake must exceed in matches.
     """
     now = _matches(rig, pairs)
     undone = [(_matches(mistake.rig(rig), [mistake.pair(pair) for pair in pairs]), mistake) for mistake in MISTAKES]
     best = max(count for count, _ in undone)
+    if corrected is not None and best <= _matches(corrected, pairs):
+        return "", False
     if best < max(MIN_MATCHES, MIN_GAIN * now):
         if now >= MIN_MATCHES:
             return "", False

@@ -31,6 +31,7 @@ SEARCH_ROWS = 14  # above and below, px
 MIN_CORNERS = 25  # with fewer, and fewer matches, an image shows too little to judge a calibration
 MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
 FITTING_SHARE = 0.5  # of the matches
+DOUBTFUL = 0.1  # of the corrected matches, behind the cameras: a mistake may explain more
 CALIBRATE = "'stereo-sfm calibrate' measures lenses; 'stereo-sfm convert-calib --lens' says what a file's numbers are"
 ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images; then use '--rig rig.yaml'"
 READ_OTHERWISE = "name their topics so ('image_rect' or 'image_raw'), or give their calibration with '--rig FILE'"
@@ -80,19 +81,22 @@ def check_start(
     if light or not cameras.judged:
         return StartFinding(light)
     other = other_reading()
-    if other is not None and _confirmed(Fit(*other, np.zeros(0)), seen, chosen):
+    if other is not None and _confirmed(Fit(*other, np.zeros(0)), seen, chosen) is not None:
         return StartFinding(*other, shown=True, advice=READ_OTHERWISE)
     lens = other_lens(rig, cameras.windows)
     if lens is not None and lens.fits:
         return _of_lens(lens)
+    pairs = [(seen[k].left, right) for k in chosen if (right := seen[k].right) is not None]
     better = None if cameras.rows_fit or cameras.rectification is None else better_fit(rig, seen, chosen)
-    if better is not None and _confirmed(better, seen, chosen):
-        return StartFinding(better.text, better.rig, better.shift, True)
+    tried = None if better is None else _confirmed(better, seen, chosen)
+    if better is not None and tried is not None:
+        text, shown = mistake(rig, pairs, better.rig) if tried.behind > DOUBTFUL and not better.shift else ("", False)
+        return StartFinding(text, shown=True) if shown else StartFinding(better.text, better.rig, better.shift, True)
     if lens is not None:
         return _of_lens(lens)
     if cameras.rows_fit:
         return StartFinding()
-    text, shown = mistake(rig, [(seen[k].left, right) for k in chosen if (right := seen[k].right) is not None])
+    text, shown = mistake(rig, pairs)
     return StartFinding(text, shown=shown)
 
 
@@ -101,11 +105,11 @@ def _of_lens(lens: OtherLens) -> StartFinding:
     return StartFinding(text, lens.rig if lens.known else None, shown=True)
 
 
-def _confirmed(better: Fit, images: Sequence[StereoImage], chosen: Sequence[int]) -> bool:
-    """Whether most pairs fit, once they are rectified and searched anew."""
+def _confirmed(better: Fit, images: Sequence[StereoImage], chosen: Sequence[int]) -> _Cameras | None:
+    """The cameras by which most pairs fit, once they are rectified and searched anew; None if they do not."""
     cameras, at = _Cameras(better.rig), [k for k in chosen if 0 <= k + better.shift < len(images)]
     fits = [cameras.fit(replace(images[k], right=images[k + better.shift].right)) for k in at]
-    return 2 * sum(fits) > len(fits)
+    return cameras if 2 * sum(fits) > len(fits) else None
 
 
 class _Cameras:
@@ -115,6 +119,7 @@ class _Cameras:
         self.rectification: Rectification | None = None
         self.judged = False  # a pair that shows something was seen
         self.rows_fit = False  # of one of the pairs
+        self.behind = 0.0  # largest share of a pair's matches near their rows that lie behind the cameras
         self.windows: list[Window] = []  # the matches of the pairs
         self._rig, self._stereo = rig, rig.second_camera is not None
         if self._stereo:
@@ -134,7 +139,9 @@ class _Cameras:
         self.windows.append(window)
         self.judged |= found.corners >= MIN_CORNERS or len(found) >= MIN_MATCHES
         ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
-        near = ahead & (np.abs(found.row_error) < LIMIT_PX)
+        in_rows = np.abs(found.row_error) < LIMIT_PX
+        near = ahead & in_rows
+        self.behind = max(self.behind, float((in_rows & ~ahead).sum()) / max(int(in_rows.sum()), 1))
         rows_fit = len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE
         self.rows_fit |= rows_fit
         return rows_fit and other_lens(self._rig, [window]) is None

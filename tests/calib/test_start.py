@@ -61,6 +61,23 @@ def test_a_mistake_in_the_images_is_reported(images: tuple[s.Rig, list[s.StereoI
     assert message in why and "\n" not in why
 
 
+def test_far_scenes_upside_down_are_not_corrected_by_a_turn() -> None:
+    """Disparities of a few pixels: a turn of 4.4 degrees would bring the rows of other matches together."""
+    with s.open_source("sim:aisle?size=320x240&frames=13") as source:
+        rig, images = source.rig, [replace(i, left=turned(i.left), right=turned(right_of(i))) for i in source]
+    found = check_start(rig, images)
+    assert "both images are upside down" in found.text and found.shown and found.rig is None
+
+
+def test_a_turn_that_leaves_points_behind_the_cameras_is_corrected(data_root: Path) -> None:
+    """The right camera is turned about y, too, which no rows show: every eighth point seems to lie behind."""
+    with s.open_source(data_root / "kitti") as source:
+        rig, images = source.rig, list(islice(source, 13))
+    bent = replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.deg2rad([0, 0, 0, 1.0, 0.6, 0])))
+    found = check_start(bent, images)
+    assert "turned by -1.0" in found.text and found.rig is not None
+
+
 def test_an_inverted_transform_is_reported(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
     rig, good = images
     inverted = replace(rig, left_T_right=se3.inverse(rig.left_T_right))
