@@ -19,6 +19,7 @@ _SIDES = ((r"left", "right"), (r"cam0", "cam1"), (r"_0(?=\.)", "_1"), (r"_l(?=\.
 def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
     """left*/right*, cam0/cam1 or *_0/*_1 images of a folder, in the order of the numbers in their names."""
     files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES}
+    files = {name: path for name, path in files.items() if "/." not in f"/{name}"}  # as `visible`, at every depth
     for left, right in _SIDES:
         pairs: list[tuple[Path, Path]] = []
         for name, path in files.items():

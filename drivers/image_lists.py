@@ -18,6 +18,7 @@ import numpy as np
 from stereo_sfm.drivers.ground_truth import stamp_from_seconds
 from stereo_sfm.drivers.text_file import LAST_NS, nanoseconds
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import visible
 from stereo_sfm.pixels import SUFFIXES
 
 log = logging.getLogger("stereo_sfm")
@@ -35,7 +36,7 @@ def list_images(folder: Path) -> list[Path]:
     """The image files of a folder in the order of their numbers (image2 before image10)."""
     if not folder.is_dir():
         raise StereoSfmError(f"no image folder {folder}")
-    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES]
+    files = [p for p in visible(folder) if p.suffix.lower() in SUFFIXES]
     if not files:
         raise StereoSfmError(f"no images in {folder}")
     return sorted(files, key=natural_key)

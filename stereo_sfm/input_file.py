@@ -10,6 +10,7 @@ import errno
 import json
 import os
 import stat
+from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,18 @@ def with_plain_numbers(tree: Any) -> Any:
         elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 63:
             raise ValueError(f"a whole number of {value.bit_length()} bits is too large")
     return tree
+
+
+def visible(folder: Path, pattern: str = "") -> Iterator[Path]:
+    """What is in a folder, in no order, without names that begin with a dot: macOS keeps attributes in ._NAME.
+
+    Args:
+        folder: it exists. pattern: of the names, as for `Path.glob`; "": all.
+
+    Raises:
+        OSError: the folder cannot be read.
+    """
+    return (p for p in (folder.glob(pattern) if pattern else folder.iterdir()) if not p.name.startswith("."))
 
 
 class NotAFile(StereoSfmError, OSError):

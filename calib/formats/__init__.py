@@ -13,6 +13,7 @@ from stereo_sfm.calib.formats.common import read_text
 from stereo_sfm.calib.formats.pair_files import left_files
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, one_of
+from stereo_sfm.input_file import visible
 
 log = logging.getLogger("stereo_sfm")
 
@@ -119,7 +120,7 @@ def _recognise_folder(path: Path) -> str | None:
     }
     found = next((name for name, files in marks.items() if any((path / f).is_file() for f in files)), None)
     if found is None:  # a file for each camera
-        files = left_files(path, ".yaml", ".yml") or sorted(path.glob("*.yaml"))
+        files = left_files(path, ".yaml", ".yml") or sorted(visible(path, "*.yaml"))
         found = _recognise_file(files[0]) if files else None
         return found if found == "ros" else None
     return found

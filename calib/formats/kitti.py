@@ -12,7 +12,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
-from stereo_sfm.input_file import read_bytes
+from stereo_sfm.input_file import read_bytes, visible
 from stereo_sfm.types import F64
 
 
@@ -87,7 +87,7 @@ def _size(path: Path, entries: dict[str, list[float]], index: int) -> tuple[int,
     from stereo_sfm.pixels import SUFFIXES, declared_size
 
     for folder in filter(Path.is_dir, folders):
-        for image in sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)[:20]:
+        for image in sorted(p for p in visible(folder) if p.suffix.lower() in SUFFIXES)[:20]:
             with suppress(ValueError, OSError):
                 return declared_size(read_bytes(image))
     raise ValueError("no image size stated, and no readable image next to the file")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stereo_sfm.calib.side_names import side_pairs
+from stereo_sfm.input_file import visible
 
 
 def partner(left: Path) -> Path | None:
@@ -18,5 +19,5 @@ def left_files(folder: Path, *suffixes: str) -> list[Path]:
 
 
 def _pairs(folder: Path, suffix: str) -> list[tuple[Path, Path]]:
-    files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix == suffix and p.is_file()}
+    files = {p.stem: p for p in sorted(visible(folder)) if p.suffix == suffix and p.is_file()}
     return [(files[a], files[b]) for a, b in side_pairs(list(files))]

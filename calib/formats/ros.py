@@ -16,6 +16,7 @@ from stereo_sfm.calib.formats.camera_info import (
 from stereo_sfm.calib.formats.common import read_yaml, reading, write_yaml
 from stereo_sfm.calib.formats.pair_files import left_files, partner
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.input_file import visible
 
 log = logging.getLogger("stereo_sfm")
 
@@ -29,7 +30,7 @@ def read_ros(path: Path | str, lens: str = "", unit: float = 1.0) -> Rig:
     left = Path(path)
     with reading(left, "ROS camera_info"):
         if left.is_dir():
-            left = next(iter(left_files(left, ".yaml", ".yml") or sorted(left.glob("*.yaml"))), left / "left.yaml")
+            left = next(iter(left_files(left, ".yaml", ".yml") or sorted(visible(left, "*.yaml"))), left / "left.yaml")
         info, other = _info(left), partner(left)
         right = _info(other) if other else None
         if right is not None and "right" not in str(other) and extrinsics(info, right) is None:

@@ -26,6 +26,7 @@ from stereo_sfm.drivers.image_lists import (
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.times_file import read_times
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import visible
 from stereo_sfm.pixels import SUFFIXES
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
     name = f"images:{folder.resolve().name}"
     found = find_pair(folder, options.left, options.right)
     if found is None:
-        there = ", ".join(sorted(p.name for p in folder.iterdir())[:8])
+        there = ", ".join(sorted(p.name for p in visible(folder))[:8])
         raise StereoSfmError(
             f"{folder} contains no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files) but {there}: "
             f"name them as in 'images:{path}?left=FOLDER&right=FOLDER'"
@@ -91,7 +92,7 @@ def find_pair(folder: Path, left: str = "", right: str = "") -> tuple[list[Path]
     if left or right:
         return _chosen(folder, left), _chosen(folder, right)
     inside = {
-        p.name: place for p in sorted(folder.iterdir()) if p.is_dir() for place in (p, p / "data") if _has_images(place)
+        p.name: place for p in sorted(visible(folder)) if p.is_dir() for place in (p, p / "data") if _has_images(place)
     }
     for names in _of_cameras(list(inside)):
         return list_images(inside[names[0]]), list_images(inside[names[1]])
@@ -120,7 +121,7 @@ def _chosen(folder: Path, text: str) -> list[Path]:
     """
     if text and (folder / text).is_dir():
         return list_images(folder / text)
-    files = [p for p in folder.glob(text) if p.suffix.lower() in SUFFIXES] if text else []
+    files = [p for p in visible(folder, text) if p.suffix.lower() in SUFFIXES] if text else []
     if not files:
         raise StereoSfmError(
             f"{folder}: '{text}' is no folder and no pattern of image files: give both left= and right="
@@ -145,7 +146,7 @@ def _by_side(files: list[Path]) -> dict[str, list[Path]]:
 
 
 def _has_images(folder: Path) -> bool:
-    return folder.is_dir() and any(p.suffix.lower() in SUFFIXES for p in folder.iterdir())
+    return folder.is_dir() and any(p.suffix.lower() in SUFFIXES for p in visible(folder))
 
 
 def _own_rig(folder: Path) -> Rig:

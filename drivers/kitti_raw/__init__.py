@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.drivers.driver import Certainty, Driver
 from stereo_sfm.drivers.options import SourceOptions, option
+from stereo_sfm.input_file import visible
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
@@ -27,7 +28,7 @@ def _open(place: str, options: KittiRawOptions) -> Source:
 
 
 def _recognise(path: Path) -> Certainty:
-    drives = (path, *sorted(path.glob("*_drive_*")))
+    drives = (path, *sorted(visible(path, "*_drive_*")))
     found = any((drive / f"image_0{i}" / "data").is_dir() for drive in drives for i in (0, 2))
     return Certainty.LAYOUT if found else Certainty.NO
 

@@ -24,6 +24,7 @@ from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.input_file import visible
 from stereo_sfm.types import F64, I64, ImuSamples, Trajectory
 
 if TYPE_CHECKING:
@@ -75,7 +76,7 @@ def open_kitti_raw(path: str, options: KittiRawOptions) -> FolderSource:
 def _drive_folder(folder: Path, drive: str) -> Path:
     if any((folder / f"image_0{i}").is_dir() for i in (0, 2)):
         return folder
-    found = sorted(p for p in folder.glob("*_drive_*") if drive in p.name and p.is_dir())
+    found = sorted(p for p in visible(folder, "*_drive_*") if drive in p.name and p.is_dir())
     if len(found) != 1:
         names = ", ".join(p.name for p in found) or "none"
         raise StereoSfmError(f"{folder} must contain one KITTI raw drive, found {names}: give the folder of the drive")
@@ -137,7 +138,7 @@ def _inertial(folder: Path) -> ImuSamples | None:
 
 def _packets(folder: Path) -> F64:
     """(N, K) numbers of the oxts; (0, 0) without them."""
-    files = sorted((folder / "oxts" / "data").glob("*.txt"))
+    files = sorted(visible(folder / "oxts" / "data", "*.txt"))
     if not files:
         return np.zeros((0, 0))
     try:

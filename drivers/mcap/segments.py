@@ -12,6 +12,7 @@ from stereo_sfm.drivers.mcap import IMAGES, McapOptions
 from stereo_sfm.drivers.mcap.source import open_mcap
 from stereo_sfm.drivers.source import BaseSource, Source, Stamps
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import visible
 from stereo_sfm.types import StereoImage
 
 log = logging.getLogger("stereo_sfm")
@@ -23,7 +24,7 @@ class SegmentsSource(BaseSource):
     def __init__(self, folder: Path, options: McapOptions) -> None:
         """Raises StereoSfmError when no segment has images (any more), or one cannot be opened."""
         self._options = options
-        self._files = [path for path in sorted(folder.glob(f"*{IMAGES}")) if path.stat().st_size]
+        self._files = [path for path in sorted(visible(folder, f"*{IMAGES}")) if path.stat().st_size]
         self.name, self._folder = str(folder), folder
         self.frame_count = 0
         rig = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.drivers.driver import Certainty, Driver
 from stereo_sfm.drivers.mcap import RECORDING, McapOptions
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.input_file import open_regular
+from stereo_sfm.input_file import open_regular, visible
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
@@ -35,7 +35,7 @@ def _open(place: str, options: McapOptions) -> Source:
 
 def _files(folder: Path) -> list[Path]:
     """The files of a rosbag2 folder."""
-    return sorted(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
+    return sorted(p for p in visible(folder) if p.suffix in (".db3", ".mcap"))
 
 
 def _recognise(path: Path) -> Certainty:

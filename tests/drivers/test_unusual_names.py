@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import cv2
@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from stereo_sfm.calib import save_rig
+from stereo_sfm.calib.formats.native import rig_to_text
+from stereo_sfm.calib.formats.pair_files import left_files
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.side_names import side_pairs
+from stereo_sfm.calib.views import find_pairs
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.drivers.images.source import find_pair
@@ -20,6 +23,7 @@ from stereo_sfm.drivers.times_file import read_times
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
+from tests.drivers import dataset_folders
 
 NS = 1403636579763555584
 
@@ -82,6 +86,39 @@ def test_names_that_tell_nothing_are_chosen(tmp_path: Path) -> None:
         assert source.frame_count == 2
     with pytest.raises(StereoSfmError, match="give both"):
         open_source(f"images:{tmp_path}?left=west")
+
+
+MAKERS = [getattr(dataset_folders, name) for name in sorted(vars(dataset_folders)) if name.startswith("make_")]
+
+
+@pytest.mark.parametrize("make", MAKERS)
+def test_what_macos_writes_beside_every_file_is_left_out(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    """Beside each NAME a ._NAME without an image, text or calibration in it."""
+    folder = make(tmp_path / "data")
+    with open_source(folder) as source:
+        rig, stamps = rig_to_text(source.rig), [(image.stamp_ns, image.right is None) for image in source]
+    for path in list((tmp_path / "data").rglob("*")):
+        path.with_name(f"._{path.name}").write_bytes(b"\x00\x05\x16\x07Mac OS X")
+    with open_source(folder) as source:
+        assert [(image.stamp_ns, image.right is None) for image in source] == stamps
+        assert rig_to_text(source.rig) == rig
+
+
+def test_hidden_files_are_no_images_and_no_calibrations(tmp_path: Path) -> None:
+    for side, level in (("left", 50), ("right", 150)):
+        write(tmp_path, [f"{side}{k}.png" for k in range(3)], level)
+        (tmp_path / f"._{side}0.png").write_bytes(b"Mac OS X")
+        write(tmp_path / f".{side}", [f"{k}.png" for k in range(9)], level)
+    for text in ("", "*.png"):
+        found = find_pair(tmp_path, text.replace("*", "left*"), text.replace("*", "right*"))
+        assert found is not None and [[p.name for p in side] for side in found] == [
+            [f"{side}{k}.png" for k in range(3)] for side in ("left", "right")
+        ]
+    assert all(len(side) == 3 for side in find_pair(tmp_path, "*left*.png", "*right*.png") or ())
+    assert len(find_pairs(tmp_path)) == 3
+    for side in ("left", "right"):
+        (tmp_path / f"._{side}.yaml").write_text("Mac OS X")
+    assert left_files(tmp_path, ".yaml") == []
 
 
 def test_recordings_side_by_side_are_no_pair(tmp_path: Path) -> None:
