@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol
 
 from stereo_sfm.drivers.selection import EVERYTHING, Selection
-from stereo_sfm.drivers.source import is_device, look_up, open_source, path_of
+from stereo_sfm.drivers.source import absolute, is_device, look_up, open_source, path_of
 from stereo_sfm.errors import StereoSfmError, one_of
 
 if TYPE_CHECKING:
@@ -136,10 +136,7 @@ class SourceChoice:
             raise StereoSfmError(
                 "a camera store holds calibrations of images that are not rectified: leave out rectify"
             )
-        look_up(source, **options)
-        spec = str(source)
-        if Path(spec).exists():
-            spec = str(Path(spec).resolve())
+        spec = absolute(str(source), look_up(source, **options).driver)
         store = None if camera_store is None else Path(camera_store).expanduser().resolve()
         return SourceChoice(spec, _loaded(rig), options, selection or EVERYTHING, rectify, speed, camera_store=store)
 

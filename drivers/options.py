@@ -40,6 +40,7 @@ def option(
     low: float | None = None,
     high: float | None = None,
     read: Callable[[Any], Any] | None = None,
+    file: bool = False,
 ) -> Any:
     """One field of a driver's options.
 
@@ -49,8 +50,9 @@ def option(
         low, high: limits of a number, both inclusive.
         read: converts the user's value, for types without a standard text form; raises ValueError with a description of
             valid values ("WIDTHxHEIGHT, such as 640x400").
+        file: its text names a file, which a log records by its absolute path.
     """
-    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "read": read})
+    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "read": read, "file": file})
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,9 @@ class SourceOptions:
 
     GROUPS: ClassVar[Mapping[str, tuple[str, ...]]] = {}
 
-    rig: RigOption = option(None, "calibration instead of the source's own: a file of any format", read=lambda x: x)  # noqa: RUF009
+    rig: RigOption = option(  # noqa: RUF009
+        None, "calibration instead of the source's own: a file of any format", read=lambda x: x, file=True
+    )
 
 
 def read_options(cls: type[O], source: str, given: Mapping[str, Any]) -> O:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, quote, unquote_plus
 
 from stereo_sfm.drivers import registry
 from stereo_sfm.drivers.driver import Driver
@@ -196,6 +196,31 @@ def path_of(spec: str) -> Path:
     """The file or folder of a source's text, if any."""
     head = spec.partition("?")[0]
     return Path(head.partition(":")[2] if _kind(spec) else spec if Path(spec).exists() else head).expanduser()
+
+
+def absolute(spec: str, driver: Driver[Any]) -> str:
+    """A source's text with absolute paths of what exists: its file or folder, and the files of its options.
+
+    Args:
+        spec: as for `open_source`. driver: which opens it.
+    """
+    if _kind(spec) is None and Path(spec).expanduser().exists():
+        return _absolute(spec)
+    head, mark, query = spec.partition("?")
+    kind, colon, named = head.partition(":") if _kind(spec) else ("", "", head)
+    there = _absolute(named) if driver.of_files else named
+    if "?" in there:  # what follows would be taken for options
+        return spec
+    files = {one.name for one in fields(driver.options) if one.metadata.get("file")}
+    parts = [part.partition("=") for part in query.split("&")]
+    options = [f"{name}={quote(_absolute(unquote_plus(text)))}" if name in files else f"{name}{equals}{text}"
+               for name, equals, text in parts]  # fmt: skip
+    return f"{kind}{colon}{there}{mark}{'&'.join(options)}"
+
+
+def _absolute(text: str) -> str:
+    path = Path(text).expanduser()
+    return str(path.resolve()) if text and not is_uri(text) and path.exists() else text
 
 
 def _kind(text: str) -> str | None:

@@ -63,7 +63,7 @@ class SimOptions(SourceOptions):
     start: int = option(0, "first frame", low=0, high=10**7)
     frames: int = option(0, "number of frames at most, 0: all", low=0, high=10**7)
     rate: float = option(30.0, "frames a second", low=1, high=1000)
-    path: str = option("", "trajectory file to drive along; the market is built around it")
+    path: str = option("", "trajectory file to drive along; the market is built around it", file=True)
     exchange: float = option(0.0, "fraction of product rows with another product than at 0", low=0, high=1)
     nights: int = option(0, "number of nights that each exchange that fraction of the rows", low=0, high=1000)
     returns: bool = option(True, "whether the camera returns to earlier places")

@@ -38,7 +38,9 @@ class T265Options(SourceOptions):
     gain: float = option(2.0, "with manual exposure", low=m.MIN_GAIN, high=m.MAX_GAIN)
     anti_flicker: Literal["50", "60", "off"] = option("50", "Hz of the mains, with automatic exposure")
     imu: bool = option(True, "pass on inertial samples with the images")
-    firmware: str | None = option(None, "path of the firmware file; auto: the file written by 't265 firmware extract'")
+    firmware: str | None = option(
+        None, "path of the firmware file; auto: the file written by 't265 firmware extract'", file=True
+    )
     allow_slow: bool = option(False, "accept a USB 2 link, with lost images")
     stamp: Literal["middle", "start"] = option("middle", "the moment of the exposure of the camera's stamps")
     queue: int = option(30, "pairs that may wait for the tracker", low=1, high=100_000)

@@ -20,7 +20,7 @@ SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".m4v")
 class VideoOptions(SourceOptions):
     """Options of `video:FILE`. Both images of one file lie side by side or one above the other: their size tells."""
 
-    right: str = option("", "file of the right camera, where each has its own")
+    right: str = option("", "file of the right camera, where each has its own", file=True)
     swap: bool = option(False, "the right image comes first")
     fps: float | None = option(None, "frames a second, where the file's times are wrong", low=1e-3, high=1e5)
 

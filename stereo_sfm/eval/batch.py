@@ -69,7 +69,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     try:
         prepare_folder(folder, overwrite=True)
         folders = MapFolders(map_out=folder / "map" if task.map_out else None)
-        opener = SourceChoice(task.spec)
+        opener = SourceChoice.of(task.spec)
         with closing(Session(opener, task.config, [record], Wiring(inline=True), folders, folder, True)) as session:
             with session:
                 begin = time.perf_counter()
