@@ -95,13 +95,15 @@ def _report(plan: Plan, folder: Path, query: str | None) -> int:
 
 
 def _upload(path: Path, to: str, mbit: float) -> int:
-    from stereo_sfm.storage.folders import Pace, cache_root, send_folder
+    from stereo_sfm.storage.folders import Pace, send_folder
     from stereo_sfm.storage.remote import Remote
     from stereo_sfm.storage.spool import Spool
 
     target, bytes_s = Remote.of(to), mbit * 1e6 / 8
     if path.is_file():
-        Spool(path.resolve(), target).send(Pace(bytes_s), keep=cache_root().resolve() not in path.resolve().parents)
+        spool = Spool.kept(path, target)
+        _refuse_unfinished(path)
+        spool.send(Pace(bytes_s))
         print(f"sent {path} to {target}")
         return 0
     if not path.is_dir():
@@ -113,5 +115,14 @@ def _upload(path: Path, to: str, mbit: float) -> int:
         count = Uploader(path, target, bytes_s).send_all()
         print(f"sent {count} files of {len(recordings(path))} recordings to {target}")
     else:
+        _refuse_unfinished(*path.rglob("*.mcap"))
         print(f"sent {send_folder(path, target, Pace(bytes_s)) / 1e6:.1f} MB to {target}")
     return 0
+
+
+def _refuse_unfinished(*files: Path) -> None:
+    from stereo_sfm.log.whole_file import being_written
+
+    for file in files:
+        if being_written(file):
+            raise StereoSfmError(f"{file} is being written: send it when it is whole")

@@ -11,12 +11,15 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.source import open_source
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
+from stereo_sfm.log.whole_file import WholeFile
 from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.recording.record import record
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.remote import Remote
+from stereo_sfm.storage.spool import Spool
 from stereo_sfm.types import StereoImage
 
 FRAMES, WIDTH, HEIGHT = 2500, 96, 64
@@ -94,3 +97,59 @@ def test_a_recording_goes_to_a_bucket_and_stays_until_it_is_there(
     assert "exists: choose another name" in capsys.readouterr().err
     assert main(["record", source, "-o", target, "-q", "--overwrite"]) == 0
     assert main(["info", target]) == 0 and "3 at" in capsys.readouterr().out
+
+
+def test_a_recording_on_its_way_is_not_replaced_or_sent_by_another_run(
+    place: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target, source = f"{place}/walk.mcap", "sim:aisle?size=96x80&frames=3"
+    spool = Spool.of(Remote.of(target), overwrite=True)
+    with open_source("sim:aisle?size=96x80&frames=8") as first:
+        running = record(first, spool.file, overwrite=True)
+        next(running)
+        for command in (
+            ["record", source, "-o", target, "-q", "--overwrite"],
+            ["record", source, "-o", target, "-q"],
+            ["fleet", "upload", str(spool.file), target],
+        ):
+            assert main(command) == 2
+            said = capsys.readouterr().err
+            assert "another run is writing" in said and "wait until it is sent" in said and "not sent" not in said
+        for _ in running:
+            pass
+    assert main(["record", source, "-o", target, "-q", "--overwrite"]) == 2  # it is whole, and being sent
+    spool.send()
+    assert main(["info", target]) == 0 and "8 at" in capsys.readouterr().out and not spool.file.exists()
+    del spool
+    assert main(["record", source, "-o", target, "-q", "--overwrite"]) == 0
+    assert main(["info", target]) == 0 and "3 at" in capsys.readouterr().out
+
+
+def test_an_unsent_recording_stays_until_its_replacement_is_whole(
+    place: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = Remote.of(f"{place}/walk.mcap")
+    kept = Spool.of(target, overwrite=False).file
+    kept.write_bytes(b"not sent yet")
+    assert main(["record", "none.mcap", "-o", str(target), "-q", "--overwrite"]) == 2
+    assert kept.read_bytes() == b"not sent yet"
+    monkeypatch.setattr("stereo_sfm.storage.spool.send_file", lambda *_: _unreachable())
+    assert main(["record", "sim:aisle?size=96x80&frames=3", "-o", str(target), "-q", "--overwrite"]) == 2
+    images = describe_file(kept).images
+    assert "it is kept" in capsys.readouterr().err and images is not None and images.count == 3
+
+
+def _unreachable() -> None:
+    raise objects.Unreachable("cannot write it")
+
+
+def test_what_is_being_written_is_not_uploaded(place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "run" / "log.mcap"
+    writing = WholeFile(file, overwrite=False)
+    for path in (file, file.parent):
+        assert main(["fleet", "upload", str(path), f"{place}/run"]) == 2
+        assert "log.mcap is being written" in capsys.readouterr().err
+    writing.finish()
+    with pytest.raises(StereoSfmError):
+        objects.read(Remote.of(f"{place}/run/log.mcap"))
+    assert main(["fleet", "upload", str(file.parent), f"{place}/run"]) == 0
