@@ -126,12 +126,14 @@ def test_a_recording_on_its_way_is_not_replaced_or_sent_by_another_run(
 
 
 def test_an_unsent_recording_stays_until_its_replacement_is_whole(
-    place: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = Remote.of(f"{place}/walk.mcap")
     kept = Spool.of(target, overwrite=False).file
     kept.write_bytes(b"not sent yet")
-    assert main(["record", "none.mcap", "-o", str(target), "-q", "--overwrite"]) == 2
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(b"\x89MCAP0\r\n" + bytes(64))
+    assert main(["record", str(damaged), "-o", str(target), "-q", "--overwrite"]) == 2
     assert kept.read_bytes() == b"not sent yet"
     monkeypatch.setattr("stereo_sfm.storage.spool.send_file", lambda *_: _unreachable())
     assert main(["record", "sim:aisle?size=96x80&frames=3", "-o", str(target), "-q", "--overwrite"]) == 2
