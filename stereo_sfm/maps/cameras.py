@@ -107,18 +107,14 @@ def cameras_text(cameras: Mapping[int, MapCamera], sessions: Sequence[int]) -> s
     of: dict[str, list[int]] = {}
     for session in sessions:
         of.setdefault(cameras[session].text, []).append(session)
-    return yaml_text(
+    entries = [
         {
-            KEY: 1,
-            "cameras": [
-                {
-                    "calibration": rig_to_plain(cameras[taken[0]].calibrated),
-                    "corrections": {k: " ".join(map(repr, cameras[k].terms.tolist())) for k in taken},
-                }
-                for taken in of.values()
-            ],
+            "calibration": rig_to_plain(cameras[taken[0]].calibrated),
+            "corrections": {k: " ".join(map(repr, cameras[k].terms.tolist())) for k in taken},
         }
-    )
+        for taken in of.values()
+    ]
+    return yaml_text({KEY: 1, "cameras": entries})
 
 
 def read_cameras(path: Path) -> dict[int, MapCamera]:

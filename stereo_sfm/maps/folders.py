@@ -23,7 +23,6 @@ from stereo_sfm.timing import NoSpans
 if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap
 
-
 log = logging.getLogger("stereo_sfm")
 
 

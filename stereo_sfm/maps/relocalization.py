@@ -18,15 +18,7 @@ from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import CLOUD_KEYFRAMES, Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase, apart
 from stereo_sfm.loop.place_view import KEPT, PlaceView, place_view_of, widest
-from stereo_sfm.loop.sideways import (
-    MIN_CORNERS,
-    SIDE_FACTOR,
-    TURNED,
-    Fronts,
-    front_of,
-    of_a_part,
-    with_neighbours,
-)
+from stereo_sfm.loop.sideways import MIN_CORNERS, SIDE_FACTOR, TURNED, Fronts, front_of, of_a_part, with_neighbours
 from stereo_sfm.loop.verification import CONFIDENT_SHARE, Verdict, pair, verify, verify_near
 from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.snapshot import MapSnapshot
@@ -78,12 +70,7 @@ class Relocalizer:
     """Finds cameras in a map. Results depend on the map, the configuration and the view only."""
 
     def __init__(
-        self,
-        snapshot: MapSnapshot,
-        rig: Rig,
-        vocabulary: Vocabulary,
-        config: LoopConfig,
-        map_rigs: Sequence[Rig] = (),
+        self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig, map_rigs: Sequence[Rig] = ()
     ) -> None:
         """Args:
         rig: of the camera. map_rigs: of each keyframe of the map, the same object for equal ones; none: the camera's.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 from collections.abc import Generator
@@ -54,6 +55,14 @@ def recover(folder: Path) -> None:
         _remove(left)
 
 
+def content(folder: Path) -> dict[str, tuple[int, int]]:
+    """Tells each file of a folder from others of its name; COMPLETE is one of them while they are replaced."""
+    with contextlib.suppress(OSError):  # none; between two renames, too
+        found = [entry for entry in os.scandir(folder) if entry.is_file() or entry.name == COMPLETE]
+        return {entry.name: (entry.stat().st_ino, entry.stat().st_mtime_ns) for entry in found}
+    return {}
+
+
 def _beside(folder: Path, ending: str) -> Path:
     return folder.with_name(f".{folder.name}.{ending}")
 
@@ -68,12 +77,9 @@ def _take_complete(folder: Path) -> None:
 def _sync(path: Path) -> None:
     """A file or folder survives a loss of power from now on."""
     descriptor = os.open(path, os.O_RDONLY)
-    try:
+    with contextlib.suppress(OSError):  # a file system that cannot
         os.fsync(descriptor)
-    except OSError:  # a file system that cannot
-        return
-    finally:
-        os.close(descriptor)
+    os.close(descriptor)
 
 
 def _cannot_move(folder: Path) -> bool:

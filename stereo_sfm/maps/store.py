@@ -22,6 +22,7 @@ from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.input_file import read_bytes, read_yaml
 from stereo_sfm.maps.floor import find_floor
 from stereo_sfm.maps.labels import Aisle, Door
+from stereo_sfm.maps.replace_folder import content
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
 from stereo_sfm.maps.unfinished import copy_map
 from stereo_sfm.types import F64
@@ -75,21 +76,12 @@ def load_current(store: Path) -> SavedMap:
         StereoSfmError: as `load_map`.
     """
     while True:
-        before = _written(store)
+        before = content(store)
         try:
             return load_map(store)
         except StereoSfmError:
-            if _written(store) == before:
+            if content(store) == before:
                 raise
-
-
-def _written(store: Path) -> tuple[int, int] | None:
-    """Tells one complete map of a store from the next; None while there is none."""
-    try:
-        found = (store / "map.json").stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_mtime_ns
 
 
 def lock_versioned(folder: Path) -> AbstractContextManager[object]:

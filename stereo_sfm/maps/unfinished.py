@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,13 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.header import read_header
-from stereo_sfm.maps.replace_folder import replaced_folder
+from stereo_sfm.maps.replace_folder import COMPLETE, content, replaced_folder
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.update import update
 from stereo_sfm.types import LoopResult
 
 PLACE = "place.npz"
+TRIES, PAUSE_S = 100, 0.02  # of a copy: the files of a map are replaced in milliseconds, even on a busy computer
 _FIELDS = ("kf_id", "candidate_kf_id", "candidate_T_kf", "information", "matches", "inliers", "score")
 
 
@@ -85,11 +87,27 @@ def publish(base: Path | None, session: Path, out: Path, config: Config) -> int:
 
 
 def copy_map(folder: Path, to: Path) -> None:
-    """A copy of a map folder that later saves of it do not change; it shares its files where the disk can do that."""
-    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name != PLACE]
-    with replaced_folder(to, frozenset(path.name for path in files)) as draft:
-        for path in files:
+    """A copy of a map folder that later saves of it do not change; it shares its files where the disk can do that.
+
+    Raises:
+        StereoSfmError: no map, or one that is being replaced all the time.
+    """
+    for _ in range(TRIES):
+        try:
+            return _copy(folder, to)
+        except FileNotFoundError:
+            time.sleep(PAUSE_S)
+    raise StereoSfmError(f"{folder} was not copied: it has no map, or is replaced again and again")
+
+
+def _copy(folder: Path, to: Path) -> None:
+    """Raises FileNotFoundError where the folder is replaced meanwhile."""
+    before = content(folder)
+    with replaced_folder(to, frozenset(before)) as draft:
+        for name in before.keys() - {PLACE, COMPLETE}:
             try:
-                os.link(path, draft / path.name)
+                os.link(folder / name, draft / name)
             except OSError:
-                shutil.copy2(path, draft / path.name)
+                shutil.copy2(folder / name, draft / name)
+        if not before or COMPLETE in before or content(folder) != before:
+            raise FileNotFoundError(folder)

@@ -192,7 +192,7 @@ class MapKeeper:
         """Save and wait for it; with a name also a copy beside the saved map.
 
         Raises:
-            StereoSfmError: the name is not a plain one.
+            StereoSfmError: the name is not a plain one, or the copy cannot be made.
         """
         if not self._store.saves or session is None:
             return Reply(False, f"no map is saved: map.mode is {self.mode}, or no pipeline runs")

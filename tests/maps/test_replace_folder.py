@@ -9,7 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.maps import unfinished
 from stereo_sfm.maps.replace_folder import recover, replaced_folder
+from stereo_sfm.maps.unfinished import copy_map
 
 KILLED = """
 import os, pathlib, signal, sys
@@ -81,3 +84,54 @@ def test_only_what_lasts_waits_for_the_disk(synced: bool, tmp_path: Path, monkey
         (draft / "a").write_text("new")
     assert len(waited) == (2 if synced else 0)
     assert texts(tmp_path / "map") == {"a": "new"}
+
+
+def save(folder: Path, text: str) -> None:
+    with replaced_folder(folder, frozenset("abc")) as draft:
+        for name in "abc":
+            (draft / name).write_text(text)
+
+
+@pytest.mark.parametrize("foreign", [{}, {"notes.txt": "mine"}])
+@pytest.mark.parametrize("links", [True, False])
+def test_a_copy_has_the_files_of_one_save(
+    foreign: dict[str, str], links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Saved again before each of the first files is copied, and before the last."""
+    folder, link, saves = tmp_path / "map", os.link, list[int]()
+    save(folder, "0")
+    for name, text in foreign.items():
+        (folder / name).write_text(text)
+
+    def busy(here: Path, there: Path) -> None:
+        if len(saves) < 9:
+            saves.append(1)
+            save(folder, str(len(saves)))
+        if not links:
+            raise OSError("no links on this disk")
+        link(here, there)
+
+    monkeypatch.setattr(os, "link", busy)
+    copy_map(folder, tmp_path / "copy")
+    assert len(saves) == 9 and texts(tmp_path / "copy") == dict.fromkeys("abc", "9") | foreign
+    save(folder, "later")
+    assert texts(tmp_path / "copy") == dict.fromkeys("abc", "9") | foreign
+
+
+def test_no_copy_is_made_while_the_files_are_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unfinished, "PAUSE_S", 0.0)
+    folder, replace, refused = tmp_path / "map", Path.replace, list[str]()
+    save(folder, "old")
+    (folder / "notes.txt").write_text("mine")
+
+    def copied(path: Path, to: Path) -> Path:
+        with pytest.raises(StereoSfmError, match="replaced again and again") as found:
+            copy_map(folder, tmp_path / "copy")
+        refused.append(str(found.value))
+        return replace(path, to)
+
+    monkeypatch.setattr(Path, "replace", copied)
+    save(folder, "new")
+    assert len(refused) == 3 and not (tmp_path / "copy").exists()
+    copy_map(folder, tmp_path / "copy")
+    assert texts(tmp_path / "copy") == {"a": "new", "b": "new", "c": "new", "notes.txt": "mine"}
