@@ -103,7 +103,7 @@ class MapKeeper:
                 self._store.release()
                 self._store = MapStore(self._next_folder, self.mode, self._store.config, _fresh=extends)
                 self._next_folder = None
-            folders = self._store.begin()
+            folders = self._store.begin(lambda: self._ending)
             self._asked = self._answered = self._ended = 0
             self._again, self._taken = False, None
             self._session += 1
@@ -164,8 +164,8 @@ class MapKeeper:
 
     def save_last(self, session: Session | None) -> None:
         """Save a session that is about to end, if there is one with images; nothing else is saved from now on."""
+        self._ending = True  # a session that is beginning holds the lock, and gives up
         with self._lock:
-            self._ending = True
             self._end_request(ENDING)
             if self._store.saves and session is not None:
                 self._last, self._before = True, self._store.written()

@@ -14,6 +14,7 @@ import logging
 import shutil
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -36,6 +37,7 @@ from stereo_sfm.pipeline.watchdog import STOPPED, process_state
 from stereo_sfm.service.child import end_with_service, pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
+LOOK_S = 0.1  # seconds between two looks whether a stop ends what a new session waits for
 RESTING = 3.0  # seconds that the search for loops rests for each of processor time: a quarter of a core at most
 
 
@@ -83,8 +85,10 @@ class MapStore:
             return None
         return file.st_ino, file.st_mtime_ns
 
-    def begin(self) -> MapFolders:
+    def begin(self, stopped: Callable[[], bool] = lambda: False) -> MapFolders:
         """The maps of a new session; a session that an earlier run did not join is joined first.
+
+        Args: stopped, no session begins any more: what is not joined stays for the next start. No maps are returned.
 
         Raises:
             StereoSfmError: there is no map to localize in, it is damaged, another process writes to it, or its folder
@@ -92,11 +96,11 @@ class MapStore:
         """
         self.cancel()
         try:
-            return self._begin()
+            return self._begin(stopped)
         except OSError as error:
             raise StereoSfmError(f"cannot use map.folder {self.folder}: {error.strerror or error}") from None
 
-    def _begin(self) -> MapFolders:
+    def _begin(self, stopped: Callable[[], bool]) -> MapFolders:
         base = self.folder.with_name(f".{self.folder.name}.base")
         if self.mode == "none":
             return MapFolders()
@@ -111,7 +115,8 @@ class MapStore:
             return folders
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         if self._fresh:
-            self._join_left_over(base)
+            if not self._join_left_over(base, stopped):
+                return MapFolders()
             if self.mode == "new" and (self.folder / "map.json").exists():
                 self._set_aside()
         self._fresh = False
@@ -126,19 +131,34 @@ class MapStore:
 
     def _set_aside(self) -> None:
         """A new map begins: the one there is kept under another name."""
-        old = self.folder.with_name(f"{self.folder.name}_{time.strftime('%Y%m%d_%H%M%S')}")
-        self.folder.rename(old)
-        log.warning("map.mode is new: the map %s is called %s now", self.folder, old)
+        log.warning("map.mode is new: the map %s is called %s now", self.folder, self._keep_aside(self.folder))
 
-    def _join_left_over(self, base: Path) -> None:
+    def _keep_aside(self, folder: Path) -> Path:
+        """Rename the saved map or the session; returns its new name."""
+        return folder.rename(self.folder.with_name(f"{self.folder.name}_{time.strftime('%Y%m%d_%H%M%S')}"))
+
+    def _join_left_over(self, base: Path, stopped: Callable[[], bool]) -> bool:
+        """In a process of its own, which a stop ends. Returns whether nothing is left to join."""
         if self.mode != "extend" or not (self.session / "map.json").exists():
-            return
-        before = base if (base / "map.json").exists() else None
-        try:
-            publish(before, self.session, self.folder, self.config)
+            return True
+        if (base / "map.json").exists():
+            self._result, send = pipe()
+            self._process = start_child("map saver", _join_once, base, self.session, self.folder, self.config, send)
+            self._waiting = 1
+        else:
+            self._done = _published(None, self.session, self.folder, self.config)
+        joined = None
+        while joined is None and not stopped():
+            joined = self.joined(LOOK_S)
+        self.cancel()
+        if joined is None:
+            log.info("the unfinished last session is added to the saved map at the next start")
+        elif not joined.why:
             log.info("the unfinished last session was added to the saved map")
-        except (StereoSfmError, OSError) as error:
-            log.warning("the last session could not be added to the saved map: %s", error)
+        else:
+            kept = f"; it is {self._keep_aside(self.session)} now" if self._died else ""
+            log.warning("the last session could not be added to the saved map: %s%s", joined.why, kept)
+        return joined is not None
 
     def prepare(self) -> None:
         """Start the process that joins, which loads the map that the session began with."""
@@ -254,6 +274,15 @@ def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests:
                     send.send(Joined(why=why) if growing is None else _grown(growing, session, out))
                     release_memory()  # maps of a day come and go
                 work.set()
+
+
+def _join_once(base: Path, session: Path, out: Path, config: Config, send: Connection) -> None:
+    """Body of the process that joins what an earlier run left."""
+    end_with_service()
+    raise_priority()  # there are no poses to delay yet
+    return_large_blocks()
+    share_one_heap()
+    send.send(_published(base, session, out, config))
 
 
 def _search(growing: GrowingMap, step: threading.Lock, free: threading.Event, work: threading.Event) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import shutil
 import signal
 import threading
 import time
@@ -20,6 +21,8 @@ import pytest
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps import unfinished
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock
 from stereo_sfm.messages import MapSaved, SaveMap
 from stereo_sfm.pipeline import map_saver
@@ -29,6 +32,7 @@ from stereo_sfm.service.child import end_with_service, start_child
 from stereo_sfm.service.config import MapConfig
 from stereo_sfm.service.map_keeper import ENDING, MapKeeper
 from stereo_sfm.service.map_store import Joined, _search  # pyright: ignore[reportPrivateUsage]
+from tests.maps.maps import small_map
 
 
 class SlowSession:
@@ -60,6 +64,61 @@ def test_the_service_is_the_only_writer_of_the_map_that_it_extends(tmp_path: Pat
         lock(tmp_path / "other")
     maps.finish(time.monotonic(), True)
     lock(tmp_path / "other").release()
+
+
+def left_over(tmp_path: Path) -> MapKeeper:
+    """Before the first session of a service, whose last one was not joined."""
+    made, saved = MapKeeper(MapConfig(str(tmp_path / "store")), Config()), small_map()[1]
+    for name in ("store", ".store.base"):
+        save_map(saved, tmp_path / name)
+    unfinished.save_session(saved, None, tmp_path / ".store.session")
+    return made
+
+
+def _endless(*_: object) -> None:
+    end_with_service()
+    time.sleep(600.0)
+
+
+@pytest.mark.parametrize("ended", ["stopped", "killed"])
+def test_a_left_over_session_holds_no_stop_up_and_is_not_lost(
+    ended: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_store, "_join_once", _endless, raising=False)
+    maps = left_over(tmp_path)
+    with ThreadPoolExecutor(1) as pool:
+        begun = pool.submit(maps.begin)
+        while (pid := maps.pid) is None and not begun.done():
+            time.sleep(0.01)
+        assert pid is not None, "it was joined in the thread of the pipelines"
+        joiner = psutil.Process(pid)
+        if ended == "stopped":
+            maps.save_last(None)
+        else:
+            joiner.kill()
+        folders = begun.result(60.0)
+    assert not joiner.is_running() and maps.pid is None
+    place = tmp_path / ".store.session"
+    if ended == "stopped":
+        assert folders == MapFolders()
+        maps.finish(time.monotonic(), complete=False)
+    else:
+        assert folders.map_in == tmp_path / ".store.base" and not place.exists()
+        (place,) = (path for path in tmp_path.glob("store_*"))
+    assert len(load_map(place)) == len(load_map(tmp_path / "store")) == len(small_map()[1])
+
+
+@pytest.mark.parametrize("based", [True, False])
+def test_a_left_over_session_is_joined_before_the_next(based: bool, tmp_path: Path, caplog: Any) -> None:
+    maps = left_over(tmp_path)
+    if not based:
+        for name in ("store", ".store.base"):
+            shutil.rmtree(tmp_path / name)
+    with caplog.at_level("INFO"):
+        folders = maps.begin()
+    said = "not found in the saved map" if based else "last session was added to the saved map"
+    assert said in caplog.text and folders.map_in is not None and not (tmp_path / ".store.session").exists()
+    assert len(load_map(folders.map_in)) == len(load_map(tmp_path / "store")) == len(small_map()[1])
 
 
 def test_a_requested_save_is_answered_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
