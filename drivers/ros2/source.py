@@ -41,6 +41,7 @@ from stereo_sfm.drivers.mcap.rig import camera_of, chain, other_reading, stereo_
 from stereo_sfm.drivers.mcap.samples import take_imu
 from stereo_sfm.drivers.mcap.topics import camera_topic, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.ros2.this_computer import keep_here
 from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.images import UnknownEncoding
@@ -133,6 +134,7 @@ class Ros2Source(BaseSource):
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
+        keep_here()
         self._context: Any = rclpy.Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         self._node: Any = rclpy.create_node(name, context=self._context)

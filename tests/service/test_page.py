@@ -640,7 +640,7 @@ def test_what_is_open_is_listed() -> None:
     assert "anyone who can reach 0.0.0.0 with the token in" in poses and "ws://127.0.0.1:8765" in foxglove
     assert "every network" in dds[0] and any("ROS_LOCALHOST_ONLY=1 hides it" in line for line in dds)
     file = next(line for line in dds if "FASTRTPS_DEFAULT_PROFILES_FILE" in line).partition("=")[2].partition(",")[0]
-    assert (Path(__file__).parents[2] / file).is_file()
+    assert (Path(__file__).parents[2] / file).is_file() and Path(file).is_absolute()
     assert ports(RobotConfig(page=PageConfig(True), security=SecurityConfig(auth="none")))[0].endswith("this computer")
     assert "https://0.0.0.0:8080" in ports(RobotConfig(page=PageConfig(True, "0.0.0.0"), security=security))[0]
 

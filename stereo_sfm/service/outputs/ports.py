@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from stereo_sfm.drivers.ros2.this_computer import PROFILE
 from stereo_sfm.service.outputs.access import is_loopback, token_file
 
 if TYPE_CHECKING:
@@ -12,9 +13,9 @@ if TYPE_CHECKING:
 
 _DDS = (
     "ros2         DDS on every network, by ROS_DOMAIN_ID; no token: whoever is in the domain may call the services.",
-    "             ROS_LOCALHOST_ONLY=1 hides it from others, but its ports stay open on every network.",
-    "             On this computer only: ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, with",
-    "             FASTRTPS_DEFAULT_PROFILES_FILE=packaging/ros2/config/this_computer.xml, or in CYCLONEDDS_URI",
+    "             On this computer only: ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST. ROS_LOCALHOST_ONLY=1 hides it, too.",
+    "             Fast DDS in the output listens on this computer alone then. Other nodes need for that",
+    f"             FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}, or with Cyclone DDS in CYCLONEDDS_URI",
     '             <General><Interfaces><NetworkInterface name="lo"/></Interfaces></General>',
 )
 _NONE = "nothing listens: no output and no page is enabled"

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from stereo_sfm.drivers.ros2.this_computer import keep_here
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.messages import HealthReport, MapCloud, PoseUpdate, ServiceMessage, Started, Status
 from stereo_sfm.service.outputs import dds_memory
@@ -81,6 +82,7 @@ class Ros2Output:
         from rclpy.executors import MultiThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
 
+        keep_here()
         dds_memory.sweep()  # a service before this one may have been killed
         try:
             if not rclpy.ok():
