@@ -17,6 +17,7 @@ TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED)
 KEPT_VERSIONS = 256  # of the map, which frames may still refer to
 WINDOW = 300  # images over which the delay from exposure to this computer is estimated
 BUFFERED_NS = 500_000_000  # most that a camera and its driver hold back: older, and the stamps do not run with time
+STALLED_NS = 3_000_000_000  # most that a busy computer holds them up: later, and the stamps were set
 
 
 class HostClock:
@@ -24,26 +25,38 @@ class HostClock:
 
     The offset is that of the image with the shortest delay among the newest ones. A step of the wall clock changes only
     the wall clock times computed after it. Where an image would be older than a camera can hold it back, its source
-    does not keep the rate of its stamps, and the estimate begins anew. A source that is not live has no clock that runs
-    with this computer's: where it is slower than its stamps say, each image is as old as its arrival.
+    does not keep the rate of its stamps, and the estimate begins anew. Not so after a stall: the images that have
+    waited come later all at once, and none of them much later than the first. A source that is not live has no clock
+    that runs with this computer's: where it is slower than its stamps say, each image is as old as its arrival.
     """
 
     def __init__(self) -> None:
         self.live = True
         self._offsets: deque[int] = deque(maxlen=WINDOW)  # monotonic clock minus stamp
         self._captured: dict[int, float] = {}
+        self._late, self._oldest = False, BUFFERED_NS  # the newest image was held up; most that a delay may grow
 
     def image(self, frame_id: int, stamp_ns: int, captured_s: float) -> None:
         """An image was handed over by its driver at a time of the monotonic clock."""
         if not self.live:
             self._offsets.clear()
         offset = int(captured_s * 1e9) - stamp_ns
-        if offset - min(self._offsets, default=offset) > BUFFERED_NS:
+        if self._offsets and self._too_old(offset):
             self._offsets.clear()
+            self._oldest = BUFFERED_NS
         self._offsets.append(offset)
         self._captured[frame_id] = captured_s
         if len(self._captured) > WINDOW:
             del self._captured[next(iter(self._captured))]
+
+    def _too_old(self, offset: int) -> bool:
+        age, late = offset - min(self._offsets), BUFFERED_NS // 2 < offset - self._offsets[-1] < STALLED_NS
+        if age <= BUFFERED_NS:
+            self._oldest = BUFFERED_NS
+        elif late and not self._late:  # twice in a row, and the source is slow
+            self._oldest = age + BUFFERED_NS // 2
+        self._late = late
+        return age > self._oldest
 
     def captured_s(self, frame_id: int) -> float:
         """When an image arrived; now where that is not known."""

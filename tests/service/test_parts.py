@@ -181,6 +181,44 @@ def test_a_camera_that_does_not_keep_its_rate_does_not_age(monkeypatch: pytest.M
     assert min(ages) > -1e-6 and max(ages) < 0.5 + 1e-6
 
 
+@pytest.mark.parametrize("stalls", [((600, 0.92),), ((600, 2.9),), ((600, 0.9), (606, 0.6)), ((600, 0.55), (700, 0.9))])
+@pytest.mark.parametrize("each_ms", [4, 15])
+def test_images_that_waited_while_the_computer_stood_still_are_not_new(
+    stalls: tuple[tuple[int, float], ...], each_ms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera at 30 Hz; those that wait are handed over one after the other, some of them late."""
+    monkeypatch.setattr("time.monotonic_ns", lambda: 0)
+    monkeypatch.setattr("time.time_ns", lambda: 0)
+    clock, rng, at, began = HostClock(), np.random.default_rng(1), 0.0, dict(stalls)
+    for k in range(1200):
+        exposed = 100.0 + k / 30
+        at = max(at + rng.uniform(0.5, 1.5) * each_ms * 1e-3, exposed + 0.02 + rng.uniform(0.0, 0.003))
+        at += began.get(k, 0.0)
+        clock.image(k, int(k / 30 * 1e9), at)
+        assert abs(clock.unix_ns(int(k / 30 * 1e9)) * 1e-9 - exposed - 0.02) < 0.005, k
+
+
+@pytest.mark.parametrize("hz", [27.0, 10.0, 3.0, 1.0])
+def test_a_slow_source_is_not_taken_for_a_stall(hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.monotonic_ns", lambda: 0)
+    monkeypatch.setattr("time.time_ns", lambda: 0)
+    clock, ages = HostClock(), list[float]()
+    for k in range(900):
+        clock.image(k, k * 33 * MS, 100.0 + k / hz)
+        ages.append(100.0 + k / hz - clock.unix_ns(k * 33 * MS) * 1e-9)
+    assert min(ages) > -1e-6 and max(ages[2:]) < 0.5 + 1e-6
+
+
+def test_stamps_that_were_set_are_followed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("time.monotonic_ns", lambda: 0)
+    monkeypatch.setattr("time.time_ns", lambda: 0)
+    clock = HostClock()
+    for k in range(600):
+        stamp = k * 33 * MS - (k >= 300) * 5000 * MS
+        clock.image(k, stamp, 100.0 + k * 0.033)
+        assert abs(clock.unix_ns(stamp) * 1e-9 - 100.0 - k * 0.033) < 1e-6
+
+
 def test_the_cloud_forgets_what_the_mapper_removed() -> None:
     clouds: list[MapCloud] = []
     follower = MapCloudBuilder(1, clouds.append)
