@@ -91,11 +91,14 @@ def write(source: Source, path: Path, options: RecordOptions, mode: str, opening
     last: Progress | None = None
     with StopRequest() as stop, progress(source.name, source.frame_count, options.quiet) as bar:
         frames = record(source, path, options.image_format, overwrite=options.overwrite, mode=mode, opening=opening)
-        for last in frames:
-            bar.step(f"{last.seconds:.1f} s · {last.dropped} dropped · {last.bytes_written / 1e6:.1f} MB")
-            if stop.asked:
-                break
-        frames.close()
+        try:
+            for last in frames:
+                bar.step(f"{last.seconds:.1f} s · {last.dropped} dropped · {last.bytes_written / 1e6:.1f} MB")
+                if stop.asked:
+                    break
+            frames.close()
+        except BaseException as error:  # such as a second Ctrl-C: what is cut off replaces no older file
+            frames.throw(error)
     if last is not None and not options.quiet:
         size = path.stat().st_size
         print(

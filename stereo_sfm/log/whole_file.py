@@ -41,6 +41,8 @@ class WholeFile:
         Raises:
             StereoSfmError: the file exists, cannot be created, or another process is writing it.
         """
+        if overwrite and path.is_symlink():  # it stays, and the file that it names is replaced
+            path = Path(os.path.realpath(path))
         self.path = self.place = path
         self._older: int | None = None  # descriptor of the file that is replaced: its lock keeps out others
         try:
@@ -71,9 +73,14 @@ class WholeFile:
         except OSError:  # a network file system without locks
             return
 
+    @property
+    def beside(self) -> bool:
+        """Whether there is an older file, which `finish` replaces."""
+        return self.place != self.path
+
     def finish(self) -> None:
         """Close it, and put it in its place. Once."""
-        if self.place != self.path:
+        if self.beside:
             os.replace(self.place, self.path)
         self.close()
 

@@ -193,7 +193,8 @@ class LogWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        beside = isinstance(error, Exception) and self._whole.place != self.path and not self.closed
+        cut = error is not None and not isinstance(error, GeneratorExit)  # one that is closed is whole
+        beside = cut and self._whole.beside and not self.closed
         self._end(self._whole.close if beside else self._whole.finish)
         if beside:  # an older file, which what is not whole does not replace
             log.warning("%s is as it was; what was written until the error is in %s", self.path, self._whole.place)
@@ -231,7 +232,7 @@ class LogWriter:
     def _kept(self) -> str:
         """Close what the disk refused to extend; what is left of it, for people."""
         place, leave = self._whole.place, self._whole.close
-        as_it_was = f"; {self.path} is as it was" if place != self.path else ""
+        as_it_was = f"; {self.path} is as it was" if self._whole.beside else ""
         try:
             messages = repair.finish_in_place(place, keep_chunks=self._keep_chunks) if self._file.tell() else 0
             if not messages and (self._keep_chunks or not self._file.tell()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import signal
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
+from stereo_sfm.commands.record import RecordOptions, write
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import open_regular, read_text
@@ -91,6 +93,47 @@ def test_an_error_leaves_the_older_file(tmp_path: Path, caplog: pytest.LogCaptur
     with pytest.raises(StereoSfmError, match="the cable"):
         list(record(Broken(fisheye_rig(), stereo_images(4, np.random.default_rng(4))), new))
     assert _frames(new) == 2
+
+
+@pytest.mark.parametrize("where", ["source", "terminal"])
+def test_a_second_interrupt_leaves_the_older_file(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "drive.mcap"
+    write_recording(path, _source(5))
+
+    class Interrupted(MemorySource):
+        def __iter__(self) -> Iterator[StereoImage]:
+            yield from itertools.islice(super().__iter__(), 2)
+            raise KeyboardInterrupt
+
+    class Bar:
+        def step(self, text: str) -> None:
+            if text.startswith("0.1"):
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr("stereo_sfm.commands.record.progress", lambda *_: contextlib.nullcontext(Bar()))
+    kind = Interrupted if where == "source" else MemorySource
+    source = kind(fisheye_rig(), stereo_images(8, np.random.default_rng(4)))
+    with pytest.raises(KeyboardInterrupt):
+        write(source, path, RecordOptions(str(path), "png", overwrite=True, quiet=True), "record")
+    assert _frames(path) == 5 and 0 < _frames(tmp_path / "drive.part.mcap") < 8
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_stays_and_the_file_that_it_names_is_replaced(there: bool, tmp_path: Path) -> None:
+    large, path = tmp_path / "large disk" / "real.mcap", tmp_path / "drive.mcap"
+    path.symlink_to(large)
+    if there:
+        write_recording(large, _source(3))
+    running = record(_source(5), path, overwrite=True)
+    next(running)
+    if there:
+        assert _frames(large) == 3
+    list(running)
+    assert path.is_symlink() and _frames(path) == _frames(large) == 5 and list(large.parent.iterdir()) == [large]
+    path.unlink()
+    path.symlink_to(path)
+    with pytest.raises(StereoSfmError, match=r"cannot write .*drive\.mcap"):
+        WholeFile(path, overwrite=True)
 
 
 def test_a_full_disk_leaves_a_readable_file_and_the_older_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
