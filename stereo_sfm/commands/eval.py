@@ -117,6 +117,8 @@ def _check_ranges(options: EvalOptions) -> None:
     for option, value in (("--t-max-diff", options.t_max_diff), ("--max-ape", options.max_ape)):
         if value is not None and not 0 <= value < float("inf"):
             raise StereoSfmError(f"{option} must be a number of at least 0, not {value:g}")
+    if options.table is not None and options.table.name in ("", ".."):
+        raise StereoSfmError(f"--table {options.table} is a folder: name a file in it, without its ending")
 
 
 def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, Trajectory]:

@@ -77,9 +77,17 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError(f"--session does not go with {DENSE}: give the --images of one session")
     write = _write_trajectories if options.format in TRAJECTORY_FORMATS else _write_map
     write = _write_dense if options.format == DENSE else write
-    paths = write(options, options.output or options.source / _default_name(options))
+    paths = write(options, _output(options))
     print(f"written to {', '.join(map(str, paths))}")
     return 0
+
+
+def _output(options: ExportOptions) -> Path:
+    """The file or folder to write: a file goes into the folder that is named instead of it."""
+    whole = options.format in ("colmap", DENSE)
+    if options.output is not None and (whole or not options.output.is_dir()):
+        return options.output
+    return (options.output or options.source) / _default_name(options)
 
 
 def _default_name(options: ExportOptions) -> str:

@@ -142,7 +142,7 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
                 saved = merge(both, vocabulary, config.loop, config.mapper, mapper.place()).saved
             except StereoSfmError as error:
                 if out.resolve() == folders.map_in.resolve():  # an unused name next to it
-                    names = (out.with_name(f"{out.name}_walk{k}") for k in itertools.count(1))
+                    names = (out.parent / f"{out.name}_walk{k}" for k in itertools.count(1))
                     out = next(name for name in names if not name.exists())
                 failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
         for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):

@@ -43,8 +43,8 @@ class About:
 
 
 def versions_folder(store: Path) -> Path:
-    """Where earlier versions are."""
-    return store.with_name(f"{store.name}.versions")
+    """Where earlier versions are: beside the folder itself, also for a link to it or `..`."""
+    return store.resolve().parent / f"{store.resolve().name}.versions"
 
 
 def lock(store: Path) -> FolderLock:

@@ -158,6 +158,8 @@ def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> Robot
         if address:
             Remote.of(address)
             require(("obstore",), "fleet", name)
+    if not config.map.folder.strip("/"):
+        raise StereoSfmError(f"map.folder is '{config.map.folder}': name a folder")
     if config.map.bucket and config.map.mode != "localize":
         raise StereoSfmError('map.bucket is for map.mode = "localize": other modes change the map on the robot')
     return config if file is None else _absolute(config, Path(file).expanduser().resolve().parent)

@@ -32,7 +32,7 @@ class MapKeeper:
     def __init__(self, config: MapConfig, pipeline: Config) -> None:
         """Args: config, folder, mode and interval; pipeline, of the stages."""
         self.save_every_min = config.save_every_min
-        self._store = MapStore(Path(config.folder), config.mode, pipeline)
+        self._store = MapStore(Path(config.folder).resolve(), config.mode, pipeline)
         self._next_folder: Path | None = None  # the map of the next session, if another one
         self.is_new = False  # the saved map begins with this session
         self._next_save_s = float("inf")

@@ -103,8 +103,10 @@ def place(text: str) -> Place:
     """A path, or the address of something in a bucket; `file://` is a path.
 
     Raises:
-        StereoSfmError: as `Remote.of`.
+        StereoSfmError: as `Remote.of`, or the text is empty.
     """
+    if not text:
+        raise StereoSfmError("an empty text names no folder: write . for this one")
     if not is_uri(text):
         return Path(text)
     found = Remote.of(text)
