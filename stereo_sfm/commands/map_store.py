@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import math
+import re
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from stereo_sfm.config import Config
     from stereo_sfm.maps.saved_map import SavedMap
 
+_NEGATIVE = re.compile(r"-[\d.].*")  # of a point: a value, no option
 ACTIONS = ("update", "undo", "versions", "label", "plan", "release", "fetch")
 
 
@@ -51,6 +54,7 @@ def add_arguments(add_action: Callable[..., argparse.ArgumentParser]) -> None:
     versions.add_argument("store", metavar="STORE", help="map folder, or address in a bucket")
     label = add_action("label", help="name an aisle, or a door, by a line on the floor plan")
     label.add_argument("store", metavar="STORE", help="map folder, or address in a bucket")
+    label._negative_number_matcher = _NEGATIVE  # pyright: ignore[reportPrivateUsage]
     label.add_argument("name", help="such as 'aisle 4' or, with --door, 'stockroom'")
     label.add_argument("start", nargs="?", type=_point, metavar="X,Y", help="metres of the floor plan")
     label.add_argument("end", nargs="?", type=_point, metavar="X,Y", help="the other end")
@@ -73,8 +77,13 @@ def add_arguments(add_action: Callable[..., argparse.ArgumentParser]) -> None:
 
 
 def _point(text: str) -> tuple[float, float]:
-    x, _, y = text.partition(",")
-    return float(x), float(y)
+    try:
+        x, y = map(float, text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is no point: write X,Y in metres, as 1.5,3") from None
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise argparse.ArgumentTypeError(f"{text} is nowhere: a point has two finite numbers of metres")
+    return x, y
 
 
 def run(args: argparse.Namespace) -> int:
