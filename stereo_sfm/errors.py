@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib.util
+import re
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,6 +44,11 @@ def from_os_error(error: OSError) -> StereoSfmError | None:
     if isinstance(error, FileExistsError):
         return StereoSfmError(f"{error.filename}: a file with this name exists already")
     return StereoSfmError(f"{error.filename}: {error.strerror}")
+
+
+def printable(text: str) -> str:
+    """A text that UTF-8 can hold: of a file name in another encoding, each odd byte is a replacement character."""
+    return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text)
 
 
 def disk_is_full(error: BaseException) -> bool:

@@ -11,6 +11,7 @@ import logging
 import os
 import resource
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -18,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.errors import StereoSfmError, printable, require
 
 # Ray's own switch for a single computer: all its ports are on the loopback address.
 LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
@@ -123,6 +124,7 @@ def _ray(address: str | None) -> Generator[Any]:
 
     ours = not ray.is_initialized()
     if ours:
+        sys.argv = [*map(printable, sys.argv)]  # which Ray reads
         _start(ray, address)
     try:
         yield ray

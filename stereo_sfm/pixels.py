@@ -10,11 +10,13 @@ import io
 import warnings
 import zlib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import U8, U16
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")  # of image files
@@ -44,6 +46,19 @@ def declared_size(data: bytes) -> tuple[int, int]:
     if width * height > MAX_PIXELS:
         raise ValueError(f"a compressed image of {width}x{height} has more than {MAX_PIXELS} pixels")
     return width, height
+
+
+def write_image(path: Path, pixels: Any) -> None:
+    """Write (H, W) or (H, W, C) pixels in the format of the suffix: `cv2.imwrite` ends the process where a name is not
+    UTF-8.
+
+    Raises:
+        StereoSfmError: the file cannot be written.
+    """
+    try:
+        path.write_bytes(cv2.imencode(path.suffix, pixels)[1])
+    except OSError as error:
+        raise StereoSfmError(f"cannot write {path}: {error.strerror}") from None
 
 
 def cut_off(data: bytes) -> bool:

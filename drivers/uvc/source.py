@@ -5,13 +5,14 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
 
 from stereo_sfm.drivers.live.errors import DeviceLost, NotFound
 from stereo_sfm.drivers.uvc import UvcOptions
-from stereo_sfm.drivers.video.source import VideoSource
+from stereo_sfm.drivers.video.source import VideoSource, capture_of
 from stereo_sfm.types import StereoImage
 
 log = logging.getLogger("stereo_sfm")
@@ -44,7 +45,9 @@ class UvcSource(VideoSource):
         self.close()
         one, (width, height) = len(self._cameras) == 1 and self.rig.right is not None, self.rig.left.size
         for camera in self._cameras:
-            capture = cv2.VideoCapture(int(camera) if camera.isdigit() else camera)
+            if not camera.isdigit() and (Path(camera).is_file() or Path(camera).is_fifo()):
+                raise NotFound(f"{camera} is no USB camera (see /dev/video*): 'video:{camera}' opens a video file")
+            capture = capture_of(int(camera) if camera.isdigit() else camera)
             self._captures.append(capture)
             if not capture.isOpened():
                 raise NotFound(f"cannot open the USB camera {camera} (see /dev/video*; does another program use it?)")

@@ -14,7 +14,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.drivers.video import VideoOptions
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, printable
 from stereo_sfm.types import U8, StereoImage
 
 log = logging.getLogger("stereo_sfm")
@@ -96,10 +96,21 @@ class VideoSource(BaseSource):
         return found[0], found[1] if len(found) > 1 else None
 
 
+def capture_of(place: int | str, backend: int = cv2.CAP_ANY) -> cv2.VideoCapture:
+    """OpenCV's reader of a video or a camera.
+
+    Raises:
+        StereoSfmError: the name is not UTF-8, at which OpenCV ends the process.
+    """
+    if isinstance(place, str) and place != printable(place):
+        raise StereoSfmError(f"{place}: OpenCV cannot open a name that is not UTF-8: rename it")
+    return cv2.VideoCapture(place, backend)
+
+
 def _opened(path: Path) -> Any:
     if not path.is_file():
         raise StereoSfmError(f"no video at {path}")
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    capture = capture_of(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise StereoSfmError(f"{path} is not a video that OpenCV can decode")
     return capture

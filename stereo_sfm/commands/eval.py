@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, printable
 from stereo_sfm.input_file import read_json
 from stereo_sfm.storage.remote import InputPath
 
@@ -82,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
             f"--delta {options.delta} is longer than the compared part: {result.frames} poses, {result.length_m:.3g} m"
         )
     if options.plot is not None:
-        _plot(options.plot, options.estimate.stem, result)
+        _plot(options.plot, printable(options.estimate.stem), result)
     if options.table is not None:
         _table(options.table, result)
     if options.json:

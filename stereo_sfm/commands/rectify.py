@@ -33,7 +33,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the images, print the row error."""
-    import cv2
     import numpy as np
 
     from stereo_sfm.calib import load_rig, save_rig
@@ -41,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.calib.matches import match_pair
     from stereo_sfm.calib.rectification import rectify
     from stereo_sfm.drivers.source import open_source
+    from stereo_sfm.pixels import write_image
 
     if args.frames < 1:
         raise _error("--frames must be at least 1")
@@ -59,12 +59,12 @@ def run(args: argparse.Namespace) -> int:
                 save_rig(rectification.rig, args.output / "rig.yaml")
             matches = match_pair(rectification, left, right)
             errors.append(matches.row_error)
-            stem = args.output / f"pair_{image.frame_id:06d}"
+            pair = f"pair_{image.frame_id:06d}"
             if args.plain:
-                cv2.imwrite(f"{stem}_left.png", left)
-                cv2.imwrite(f"{stem}_right.png", right)
+                write_image(args.output / f"{pair}_left.png", left)
+                write_image(args.output / f"{pair}_right.png", right)
             else:
-                cv2.imwrite(f"{stem}.png", side_by_side(left, right, matches))
+                write_image(args.output / f"{pair}.png", side_by_side(left, right, matches))
     if not errors:
         raise _error(f"{args.source} gave no images")
     camera = rectification.rig.left

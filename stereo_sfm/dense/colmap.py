@@ -99,11 +99,10 @@ def _undistorted(source: Camera, target: Pinhole, image: U8) -> U8:
 
 
 def _write_image(path: Path, pixels: U8) -> None:
-    import cv2
+    from stereo_sfm.pixels import write_image
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), pixels):
-        raise StereoSfmError(f"cannot write {path}")
+    write_image(path, pixels)
 
 
 def _write_model(saved: SavedMap, chosen: list[int], folder: Path) -> None:

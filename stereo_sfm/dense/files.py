@@ -250,7 +250,7 @@ def write_heights(path: Path, mesh: Mesh, plan: FloorPlan) -> None:
 
     Its pixels are those of the costmap `plan`, so that its YAML holds for both.
     """
-    import cv2
+    from stereo_sfm.pixels import write_image
 
     height, width = plan.image.shape
     top: F32 = np.full((height, width), -np.inf, np.float32)
@@ -262,4 +262,4 @@ def write_heights(path: Path, mesh: Mesh, plan: FloorPlan) -> None:
     if known.any():
         heights = mesh.heights()
         picture = height_colours(np.where(known, top, heights[0]), heights)
-        cv2.imwrite(str(path), np.dstack([picture, np.where(known, 255, 0).astype(np.uint8)]))
+        write_image(path, np.dstack([picture, np.where(known, 255, 0).astype(np.uint8)]))

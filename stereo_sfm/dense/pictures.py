@@ -136,6 +136,6 @@ def _turbo(share: U8) -> U8:
 
 
 def _write(path: Path, picture: Any) -> None:
-    import cv2
+    from stereo_sfm.pixels import write_image
 
-    cv2.imwrite(str(path), np.ascontiguousarray(picture))
+    write_image(path, np.ascontiguousarray(picture))

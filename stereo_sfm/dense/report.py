@@ -36,7 +36,7 @@ def write_report(folder: Path, source: str, voxel: float, numbers: dict[str, flo
         lines += ["", f"{text}:", "", f"![{text}]({name})"]
     path = folder / "report.md"
     try:
-        path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+        path.write_text("\n".join([*lines, ""]), encoding="utf-8", errors="replace")
     except OSError as error:
         raise StereoSfmError(f"cannot write {path}: {error.strerror}") from None
     return path

@@ -285,5 +285,5 @@ def write_report(folder: Path, results: Sequence[CellResult]) -> Path:
         slug = f"{number + 1:02d}"
         lines += ["", *[f"![{plot}]({plot})" for plot in write_plots(folder, slug, own)], ""]
     path = folder / "ablation.md"
-    path.write_text("\n".join(lines), encoding="utf-8")
+    path.write_text("\n".join(lines), encoding="utf-8", errors="replace")
     return path

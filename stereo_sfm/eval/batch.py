@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.config import Config, dump
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, printable
 from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.eval.tables import write_table
 from stereo_sfm.input_file import read_json
@@ -151,6 +151,7 @@ def table_row(name: str, result: dict[str, Any]) -> list[Any]:
 
 
 def _shown(cell: str) -> str:
+    cell = printable(cell)
     return cell if len(cell) <= CELL else f"{cell[: CELL - 1]}…"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.config import parse_toml
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, printable
 from stereo_sfm.eval import plots
 from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
 from stereo_sfm.eval.html_page import take_plots, to_html
@@ -55,7 +55,7 @@ def stats_of(folder: Path) -> dict[str, Any]:
 
 def names_of(folders: Sequence[Path]) -> list[str]:
     """The names of folders, with as many of their parents as make them differ."""
-    parts = [folder.resolve().parts for folder in folders]
+    parts = [tuple(map(printable, folder.resolve().parts)) for folder in folders]
     longest = max(map(len, parts))
     taken = next((n for n in range(1, longest) if len({one[-n:] for one in parts}) == len(parts)), longest)
     return ["/".join(one[-taken:]) for one in parts]
@@ -90,8 +90,8 @@ def compare(runs: Sequence[ComparedRun], folder: Path) -> Path:
     page = folder / "compare.html"
     page.write_text(
         to_html("stereo-sfm compare", "\n".join(lines), take_plots(folder, ("trajectory", "errors", "times"))),
-        encoding="utf-8",
-    )
+        encoding="utf-8", errors="replace",
+    )  # fmt: skip
     return page
 
 

@@ -25,7 +25,7 @@ ADVICE = {
     "not_found": "the camera saw no known place: clear its view, or drive back to where tracking last worked",
 }
 SHOWN_ROWS = 50  # of a table
-# Why a loop candidate was rejected (`LoopResult.rejected`), as in docs/glossary.md.
+# Why a loop candidate was rejected (`LoopResult.rejected`).
 REJECTIONS = {
     "too_few_matches": "too few corners have a similar descriptor",
     "no_pose": "the matches fit no pose",
@@ -94,7 +94,7 @@ def write_report(
     ]
     if "latency" in shown:
         lines.append("`latency` is the time from the arrival of an image to its pose; the plot omits it.")
-    with (folder / "report.md").open("w", encoding="utf-8") as report:
+    with (folder / "report.md").open("w", encoding="utf-8", errors="replace") as report:
         report.write("\n".join([*lines, "", _glossary(folder), ""]))
         for name, draw in drawings.items():
             report.flush()
@@ -105,7 +105,7 @@ def write_report(
             if name != "trajectory":  # it is at the beginning
                 report.write(f"\n![{name}]({name}.png)\n")
     page = to_html(source_name, (folder / "report.md").read_text("utf-8"), take_plots(folder, drawings))
-    (folder / "report.html").write_text(page, encoding="utf-8")
+    (folder / "report.html").write_text(page, encoding="utf-8", errors="replace")
 
 
 def _glossary(folder: Path) -> str:

@@ -78,7 +78,7 @@ def write_results(
         keyframes = record.keyframe_trajectory()
         if len(keyframes):
             _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
-        (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8")
+        (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8", errors="replace")
         save_rig(rig, folder / "rig.yaml")
         write_corrected_rig(folder, rig, record, mounting)
         evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")

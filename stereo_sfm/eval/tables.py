@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from stereo_sfm.errors import printable
+
 log = logging.getLogger("stereo_sfm")
 
 
@@ -25,7 +27,7 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]
         The written files.
     """
     made = [[_value(value) for value in row] for row in rows]
-    file = path.with_name(f"{path.name}.csv")
+    file, other = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.parquet")
     with file.open("w", newline="", encoding="utf-8") as stream:
         csv.writer(stream).writerows([columns, *(["" if value is None else value for value in row] for row in made)])
     if importlib.util.find_spec("pyarrow") is None:
@@ -35,13 +37,13 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]
     from pyarrow import parquet
 
     data = {name: _column([row[k] for row in made]) for k, name in enumerate(columns)}
-    other = path.with_name(f"{path.name}.parquet")
     parquet.write_table(pyarrow.table(data), other)
     return [file, other]
 
 
 def _value(value: Any) -> Any:
     """None for what is missing: an empty text, or no number."""
+    value = printable(value) if isinstance(value, str) else value
     return None if value == "" or (isinstance(value, float) and not math.isfinite(value)) else value
 
 

@@ -131,11 +131,10 @@ def description(plan: FloorPlan, image: str) -> str:
 
 def write_floor_plan(plan: FloorPlan, path: Path) -> None:
     """Write the two `plan_files` of a path."""
-    import cv2
+    from stereo_sfm.pixels import write_image
 
     image, about = plan_files(path)
-    if not cv2.imwrite(str(image), plan.image):
-        raise StereoSfmError(f"cannot write {image}: may you write there, and is the disk full?")
+    write_image(image, plan.image)
     about.write_text(description(plan, image.name), encoding="utf-8")
 
 

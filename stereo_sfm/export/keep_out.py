@@ -14,7 +14,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan, description
 from stereo_sfm.input_file import read_bytes, read_yaml
-from stereo_sfm.pixels import decode
+from stereo_sfm.pixels import decode, write_image
 from stereo_sfm.types import U8, Bool
 
 DRAWING, ABOUT, MASK = "keepout.png", "keepout.yaml", "keepout_mask"
@@ -60,7 +60,6 @@ def write_zones(folder: Path, plan: FloorPlan, zones: Bool) -> None:
     picture[zones] = RED
     mask: U8 = np.where(zones, OCCUPIED, FREE).astype(np.uint8)
     for name, image in ((DRAWING, picture), (f"{MASK}.pgm", mask)):
-        if not cv2.imwrite(str(folder / name), image):
-            raise StereoSfmError(f"cannot write {folder / name}: may you write there, and is the disk full?")
+        write_image(folder / name, image)
     (folder / ABOUT).write_text(description(plan, DRAWING), encoding="utf-8")
     (folder / f"{MASK}.yaml").write_text(description(plan, f"{MASK}.pgm"), encoding="utf-8")

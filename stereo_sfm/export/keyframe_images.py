@@ -101,8 +101,7 @@ def _names(saved: SavedMap, session: int, side: str) -> dict[Key, str]:
 
 
 def _write(path: Path, pixels: U8) -> None:
-    import cv2
+    from stereo_sfm.pixels import write_image
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), pixels):
-        raise StereoSfmError(f"cannot write {path}: may you write there, and is the disk full?")
+    write_image(path, pixels)

@@ -79,7 +79,7 @@ def report(connection: Any, folder: Path) -> tuple[list[str], Path]:
         plot_trends(Path(place) / "trends.png", *tables["trends"])
         plots = take_plots(Path(place), ("trends",))
     page = folder / "fleet.html"
-    page.write_text(to_html("stereo-sfm fleet", "\n".join(parts), plots), encoding="utf-8")
+    page.write_text(to_html("stereo-sfm fleet", "\n".join(parts), plots), encoding="utf-8", errors="replace")
     return lines, page
 
 

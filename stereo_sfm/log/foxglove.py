@@ -21,6 +21,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from stereo_sfm.errors import printable
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Pinhole
 from stereo_sfm.types import F32, F64, I64, LiveDepth
@@ -188,4 +189,4 @@ def scene(frame: str, stamp_ns: int, entities: Iterable[tuple[str, LinePrimitive
 
 def text(stamp_ns: int, level: str, message: str, name: str = "stereo_sfm") -> Log:
     """A human-readable line; `level` is a name of `logging`."""
-    return stamp(Log(level=LEVELS.get(level, 2), message=message, name=name), stamp_ns)  # pyright: ignore[reportArgumentType]
+    return stamp(Log(level=LEVELS.get(level, 2), message=printable(message), name=name), stamp_ns)  # pyright: ignore[reportArgumentType]

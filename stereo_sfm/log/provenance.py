@@ -11,6 +11,7 @@ from stereo_sfm import __version__
 from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, dump
+from stereo_sfm.errors import printable
 from stereo_sfm.log.machine import arithmetic
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.topics import SCHEMA_VERSION
@@ -87,10 +88,10 @@ def write_provenance(
     if opening is not None and opening.rig is not None:
         writer.attach(SOURCE_RIG_FILE, rig_to_text(opening.rig), "application/yaml")
     if config is not None:
-        text = dump(config)
+        text = printable(dump(config))
         values |= {"seed": str(config.seed), "config_sha256": config_hash(text)}
         writer.attach(CONFIG_FILE, text, "application/toml")
-    writer.metadata(METADATA, values)
+    writer.metadata(METADATA, {name: printable(value) for name, value in values.items()})
     writer.attach(VERSIONS_FILE, versions())
 
 

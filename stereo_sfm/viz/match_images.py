@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stereo_sfm.pixels import write_image
 from stereo_sfm.types import F64, I64, U8, Bool, Frame, Keyframe, StereoImage
 
 _UNMATCHED = (160, 160, 160)  # BGR
@@ -96,4 +97,4 @@ class MatchImages:
         )
         folder = self.folder or Path("matches")
         folder.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(folder / f"{frame.frame_id:06d}.png"), canvas)
+        write_image(folder / f"{frame.frame_id:06d}.png", canvas)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -28,7 +31,7 @@ class Capture:
     count, attached, stamped = 5, True, True
     opened = 0
 
-    def __init__(self, camera: int | str) -> None:
+    def __init__(self, camera: int | str, backend: int) -> None:
         self.camera, self.left, self.asked = camera, self.count, {}
         self.size: tuple[float, float] = self.sizes[0]
         Capture.opened += 1
@@ -112,3 +115,11 @@ def test_what_cannot_be_is_one_line(camera: type[Capture]) -> None:
     camera.attached = False
     with pytest.raises(NotFound, match="cannot open the USB camera 0"):
         DRIVER.open("0", options())
+
+
+@pytest.mark.parametrize("make", [Path.touch, os.mkfifo])
+def test_a_file_or_a_pipe_is_no_camera(make: Callable[[Path], None], tmp_path: Path) -> None:
+    """OpenCV would wait for whoever writes into the pipe."""
+    make(tmp_path / "video0")
+    with pytest.raises(NotFound, match="video0 is no USB camera"):
+        DRIVER.open(str(tmp_path / "video0"), UvcOptions(rig=RIG))
