@@ -18,6 +18,7 @@ from stereo_sfm.calib.mask import read_mask
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.folder_source import UnreadableImage, read_gray
 from stereo_sfm.drivers.ground_truth import read_trajectory
+from stereo_sfm.drivers.t265.firmware import extract
 from stereo_sfm.drivers.text_file import nanoseconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.compare import stats_of
@@ -35,8 +36,10 @@ OWN = {
     "stereo_sfm/service/page/app.py", "stereo_sfm/service/outputs/floor_grid.py", "stereo_sfm/eval/report.py",
     "stereo_sfm/eval/html_page.py", "stereo_sfm/eval/calibration_results.py", "stereo_sfm/commands/batch.py",
     "drivers/registry.py",
+    "drivers/video/source.py", "drivers/rosbag/checked.py",  # they look at the file before
 }  # fmt: skip
-READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt"}
+READERS = {"read_text", "read_bytes", "imread", "loadtxt", "genfromtxt", "VideoCapture"}
+ARCHIVES = {"ZipFile", "is_zipfile"}  # which also read bytes, and write
 
 
 def opens(call: ast.Call) -> bool:
@@ -47,6 +50,10 @@ def opens(call: ast.Call) -> bool:
         return False
     if call.func.attr in READERS:
         return not (isinstance(call.func.value, ast.Name) and call.func.value.id == "input_file")
+    if call.func.attr in ARCHIVES:
+        return not any("BytesIO(" in ast.unparse(arg) or ast.unparse(arg) == "'w'" for arg in call.args)
+    if ast.unparse(call.func) == "sqlite3.connect":
+        return True
     mode = call.args[0].value if call.args and isinstance(call.args[0], ast.Constant) else ""
     return call.func.attr == "open" and mode in ("r", "rb")
 
@@ -66,6 +73,9 @@ def test_every_reader_goes_through_input_file() -> None:
 def test_what_the_search_finds() -> None:
     texts = {
         "open(path)": True, "path.open('rb')": True, "path.read_text()": True, "cv2.imread(name)": True,
+        "zipfile.ZipFile(path)": True, "zipfile.is_zipfile(path)": True, "zipfile.ZipFile(io.BytesIO(data))": False,
+        "zipfile.ZipFile(path, 'w', 8)": False, "cv2.VideoCapture(name)": True, "sqlite3.connect(uri)": True,
+        "self.socket.connect(address)": False,
         "read_text(path)": False, "input_file.read_text(path)": False, "path.open('w')": False, "source.open()": False,
     }  # fmt: skip
     for text, wanted in texts.items():
@@ -98,7 +108,7 @@ READS: dict[str, Callable[[Path], Any]] = {
     "stats.json": lambda p: stats_of(p.parent), "words.npz": load_vocabulary, "of_a_map.yaml": _read_rig_of_map,
     "drive.bag": lambda p: open_source(f"rosbag:{p}"), "alone.db3": lambda p: open_source(f"rosbag:{p}"),
     "alone.mcap": lambda p: open_source(f"rosbag:{p}"), "in_a_folder.db3": _read_bag, "in_a_folder.mcap": _read_bag,
-    "result.json": read_json,
+    "result.json": read_json, "pyrealsense2.whl": extract, "firmware.so": extract,
 }  # fmt: skip
 
 

@@ -7,9 +7,11 @@ these versions contain it: `stereo-sfm t265 firmware extract FILE`.
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import struct
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +24,7 @@ SIZE = 9_323_648
 SHA1 = "c3940ccbb0e3045603e4aceaa2d73427f96e24bc"
 FILE_NAME = f"target-{VERSION}.mvcmd"
 ENVIRONMENT = "STEREO_SFM_T265_FIRMWARE"
+MOST_UNPACKED = 512 << 20  # bytes of the libraries in a wheel, which have some 30 MB each
 _MAGIC = b"MA2x"
 OFFICIAL = frozenset({SHA1})
 
@@ -87,7 +90,7 @@ def extract(source: Path, accepted: frozenset[str] = OFFICIAL) -> Firmware:
     """
     try:
         members = _members(source)
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise StereoSfmError(f"cannot read {source}: {error}") from None
     versions: list[str] = []
     for data in members:
@@ -101,11 +104,15 @@ def extract(source: Path, accepted: frozenset[str] = OFFICIAL) -> Firmware:
 
 
 def _members(source: Path) -> list[bytes]:
-    if not zipfile.is_zipfile(source):
-        return [read_bytes(source)]
-    with zipfile.ZipFile(source) as wheel:
-        names = [n for n in wheel.namelist() if ".so" in n or n.endswith((".pyd", ".dll", ".dylib", ".mvcmd"))]
-        return [wheel.read(n) for n in names]
+    data = read_bytes(source)
+    if not zipfile.is_zipfile(io.BytesIO(data)):
+        return [data]
+    with zipfile.ZipFile(io.BytesIO(data)) as wheel:
+        ends = (".pyd", ".dll", ".dylib", ".mvcmd")
+        members = [m for m in wheel.infolist() if ".so" in m.filename or m.filename.endswith(ends)]
+        if sum(m.file_size for m in members) > MOST_UNPACKED:
+            raise zipfile.BadZipFile(f"its libraries have more than {MOST_UNPACKED >> 20} MB")
+        return [wheel.read(m) for m in members]
 
 
 def _by_magic(data: bytes) -> list[bytes]:

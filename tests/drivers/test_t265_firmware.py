@@ -77,6 +77,29 @@ def test_files_without_the_firmware(tmp_path: Path, content: bytes) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_a_wheel_that_unpacks_to_too_much(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wheel = tmp_path / "pyrealsense2.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(3):
+            archive.writestr(f"{number}.so", bytes(1 << 20))
+    monkeypatch.setattr(firmware, "MOST_UNPACKED", (3 << 20) - 1)
+    with pytest.raises(StereoSfmError, match=r"cannot read .*whl: its libraries have more than 2 MB"):
+        firmware.extract(wheel)
+
+
+@pytest.mark.parametrize("at", [30, 60, 100, 130])
+def test_a_damaged_wheel(at: int, tmp_path: Path) -> None:
+    wheel = tmp_path / "pyrealsense2.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a.so", bytes(range(256)))
+    data = bytearray(wheel.read_bytes())
+    for place in (at, data.index(b"PK\x01\x02") + 8):  # bytes of the library, and the flags of the list: encrypted
+        data[place] ^= 1
+        wheel.write_bytes(data)
+        with pytest.raises(StereoSfmError, match="cannot read"):
+            firmware.extract(wheel)
+
+
 def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     monkeypatch.delenv(firmware.ENVIRONMENT, raising=False)
