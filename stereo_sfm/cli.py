@@ -138,14 +138,17 @@ def _fetched(value: object) -> object:
     """An argument; what a command reads as a copy, where it is in a bucket.
 
     Raises:
-        StereoSfmError: it cannot be fetched, or is not what a command reads: the folder `s3:` would be made of it.
+        StereoSfmError: it cannot be fetched, or is not what a command reads: the folder `s3:` would be made of it. It
+            is a pipe, which would hold up who opens it.
     """
     if not isinstance(value, Path):
         return value
+    from stereo_sfm.input_file import refuse_pipe
     from stereo_sfm.storage.remote import InputPath, of_path
 
     remote = of_path(value)
     if remote is None:
+        refuse_pipe(value)
         return value
     if not isinstance(value, InputPath):
         raise StereoSfmError(f"{remote} cannot be here, only a path ('stereo-sfm fleet upload' sends a folder)")

@@ -92,6 +92,16 @@ def open_regular(path: Path, most: int | None = None) -> BufferedReader:
     return os.fdopen(descriptor, "rb")
 
 
+def refuse_pipe(path: Path) -> None:
+    """Check that a file may be written: opening a pipe of a name waits for a reader. /dev/stdout is none.
+
+    Raises:
+        StereoSfmError: it is such a pipe.
+    """
+    if path.resolve().is_fifo():
+        raise StereoSfmError(f"cannot use {path}: it is not a file but a pipe")
+
+
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     """The bytes of a file.
 

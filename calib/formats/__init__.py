@@ -13,7 +13,7 @@ from stereo_sfm.calib.formats.common import read_text
 from stereo_sfm.calib.formats.pair_files import left_files
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, one_of
-from stereo_sfm.input_file import visible
+from stereo_sfm.input_file import refuse_pipe, visible
 
 log = logging.getLogger("stereo_sfm")
 
@@ -87,6 +87,7 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
         log.warning("%s cannot store wheel odometry, its calibration is lost: the format 'rig' keeps it", name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        refuse_pipe(path)
         write(rig, path)
     except OSError as error:
         raise StereoSfmError(f"cannot write the calibration to {path}: {error.strerror}") from None

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import printable
+from stereo_sfm.input_file import refuse_pipe
 
 log = logging.getLogger("stereo_sfm")
 
@@ -25,9 +26,14 @@ def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[Any]
 
     Returns:
         The written files.
+
+    Raises:
+        StereoSfmError: one of them is a pipe.
     """
     made = [[_value(value) for value in row] for row in rows]
     file, other = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.parquet")
+    refuse_pipe(file)
+    refuse_pipe(other)
     with file.open("w", newline="", encoding="utf-8") as stream:
         csv.writer(stream).writerows([columns, *(["" if value is None else value for value in row] for row in made)])
     if importlib.util.find_spec("pyarrow") is None:

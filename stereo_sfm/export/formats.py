@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.errors import StereoSfmError, did_you_mean
+from stereo_sfm.input_file import refuse_pipe
 
 if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap
@@ -76,4 +77,5 @@ def _check(format: str, known: Sequence[str], kind: str) -> None:
 def _ready(path: str | Path) -> Path:
     path = Path(path).expanduser()
     path.parent.mkdir(parents=True, exist_ok=True)
+    refuse_pipe(path)
     return path

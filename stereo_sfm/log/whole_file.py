@@ -10,7 +10,7 @@ import stat
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.input_file import open_regular
+from stereo_sfm.input_file import open_regular, refuse_pipe
 
 MODE = 0o644  # less what the umask takes
 
@@ -39,10 +39,11 @@ class WholeFile:
         """Args: path, its folder is made. overwrite: replace an existing file.
 
         Raises:
-            StereoSfmError: the file exists, cannot be created, or another process is writing it.
+            StereoSfmError: the file exists, is a pipe, cannot be created, or another process is writing it.
         """
         if overwrite and path.is_symlink():  # it stays, and the file that it names is replaced
             path = Path(os.path.realpath(path))
+        refuse_pipe(path)
         self.path = self.place = path
         self._older: int | None = None  # descriptor of the file that is replaced: its lock keeps out others
         try:
