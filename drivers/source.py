@@ -223,6 +223,18 @@ def _absolute(text: str) -> str:
     return str(path.resolve()) if text and not is_uri(text) and path.exists() else text
 
 
+def spec_in(folder: Path, spec: str) -> str:
+    """The text of a source with its file or folder, where that is in `folder`, from there."""
+    head, mark, query = spec.partition("?")
+    kind, colon, place = head.partition(":")
+    if kind not in registry.kinds():
+        kind, colon, place = "", "", head
+    elif not registry.driver(kind).place.startswith(("FOLDER", "FILE")):
+        return spec
+    there = folder / Path(place).expanduser()
+    return f"{kind}{colon}{there}{mark}{query}" if place and there.exists() else spec
+
+
 def _kind(text: str) -> str | None:
     """The kind at the beginning of a text, None if it is a path."""
     head = text.partition("?")[0]

@@ -6,6 +6,7 @@ Each setting stands with its default, the values that it takes, and one sentence
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import math
 import tomllib
@@ -16,7 +17,7 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_text
-from stereo_sfm.settings import explained, merge, number, path, read, switch, word
+from stereo_sfm.settings import explained, merge, number, path, read, switch, walk, word
 
 MAX_LINE, MAX_TEXT = 4096, 1 << 20  # characters of a configuration file
 MAX_CORES = 1024  # of a machine
@@ -462,7 +463,7 @@ def load(path: Path | str | None = None, overrides: Iterable[str] = (), base: di
     if path is not None:
         data = merge(data, _with_current_names(read_toml(Path(path).expanduser())))
     for override in overrides:
-        data = merge(data, _with_current_names(parse_override(override)))
+        data = merge(data, _with_current_names(parse_override(override, Config())))
     return from_dict(data)
 
 
@@ -480,8 +481,8 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from None
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """The nested values of a configuration file.
+def read_toml(path: Path, see: str = "stereo-sfm config dump") -> dict[str, Any]:
+    """The nested values of a configuration file. Args: see, the command that prints one.
 
     Raises:
         StereoSfmError: it cannot be read, or is not TOML.
@@ -489,7 +490,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         return parse_toml(read_text(path, MAX_TEXT))
     except FileNotFoundError:
-        raise StereoSfmError(f"no configuration file at {path} ('stereo-sfm config dump' prints one)") from None
+        raise StereoSfmError(f"no configuration file at {path} ('{see}' prints one)") from None
     except OSError as error:
         raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -498,12 +499,14 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise StereoSfmError(f"configuration {path}: {error}") from None
 
 
-def parse_override(override: str) -> dict[str, Any]:
-    """`key.subkey=value` as nested values."""
+def parse_override(override: str, tree: Any) -> dict[str, Any]:
+    """`key.subkey=value` as nested values, where a setting of `tree` that is a text takes the value as it is."""
     key, equals, value = override.partition("=")
     if not equals:
         raise StereoSfmError(f"--set takes key=value, as tracker.max_features=600, not '{override}'")
-    for text in (value, repr(value)):
+    quoted = json.dumps(value, ensure_ascii=False)  # a string of JSON is one of TOML
+    is_text = any(name == key.strip() and isinstance(old, str) for name, _, old in walk(tree))
+    for text in (value, quoted) if not is_text or value.strip()[:1] in ("'", '"') else (quoted,):
         try:
             return parse_toml(f"{key} = {text}")
         except ValueError:

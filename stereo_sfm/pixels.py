@@ -56,7 +56,7 @@ def write_image(path: Path, pixels: Any) -> None:
         StereoSfmError: the file cannot be written.
     """
     try:
-        path.write_bytes(cv2.imencode(path.suffix, pixels)[1])
+        path.write_bytes(cv2.imencode(path.suffix, pixels)[1].tobytes())
     except OSError as error:
         raise StereoSfmError(f"cannot write {path}: {error.strerror}") from None
 

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import field
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, TypeVar
 
 from stereo_sfm.errors import StereoSfmError, did_you_mean
@@ -35,8 +36,8 @@ def switch(default: bool, text: str) -> Any:
 
 
 def path(text: str, default: str = "") -> Any:
-    """The path of a file or folder."""
-    return field(default=default, metadata={"text": text})
+    """The path of a file or folder: in a file of settings, relative to the file's folder."""
+    return field(default=default, metadata={"text": text, "path": True})
 
 
 def line(default: str, text: str) -> Any:
@@ -77,6 +78,19 @@ def check(tree: Any) -> None:
 def plain(value: float) -> str:
     """A number as text, whole numbers with all digits."""
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def placed(tree: T, folder: Path) -> T:
+    """A tree of settings whose paths are absolute. Args: folder, that relative ones begin in."""
+    changed: dict[str, Any] = {}
+    for name, f, value in walk(tree):
+        if value and "path" in f.metadata and "://" not in value:
+            *sections, key = name.split(".")
+            at = changed
+            for section in sections:
+                at = at.setdefault(section, {})
+            at[key] = str(folder / Path(value).expanduser())
+    return read(tree, changed, "")
 
 
 def merge(base: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:

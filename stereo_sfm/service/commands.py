@@ -163,7 +163,7 @@ class Commands:
 
     def set_setting(self, name: str, value: str) -> Reply:
         """Change a setting that may change while running; it is not written to robot.toml."""
-        override = parse_override(f"{one_of(name, CHANGEABLE, 'setting that may change')}={value}")
+        override = parse_override(f"{one_of(name, CHANGEABLE, 'setting that may change')}={value}", self.config)
         self.config = changed = read(self.config, override, SEE)
         self._recorder.change(changed.recording)
         self._reporter.config = changed.recording

@@ -13,7 +13,7 @@ from stereo_sfm.config import parse_override, read_toml
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.presets import PRESETS, preset
 from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, SecurityConfig
-from stereo_sfm.settings import explained, line, merge, number, path, read, switch, word
+from stereo_sfm.settings import explained, line, merge, number, path, placed, read, switch, word
 from stereo_sfm.storage.remote import Remote
 
 if TYPE_CHECKING:
@@ -143,16 +143,24 @@ class RobotConfig:
 
 
 def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> RobotConfig:
-    """Defaults, a TOML file, then `section.key=value` overrides. Paths are relative to the file's folder.
+    """Defaults, a TOML file, then `section.key=value` overrides. Paths are relative to the file's folder, but for the
+    source of an override.
 
     Raises:
         StereoSfmError: the file cannot be read, has an unknown key, or a value that its setting does not take.
     """
+    from stereo_sfm.drivers.source import spec_in
+    from stereo_sfm.service.outputs.pose_socket import Place
+
     data: dict[str, Any] = {}
+    folder = Path() if file is None else Path(file).expanduser().resolve().parent
     if file is not None:
-        data = read_toml(Path(file).expanduser())
+        data = read_toml(Path(file).expanduser(), SEE)
+        source = data.get("source")
+        if isinstance(source, dict) and isinstance(source.get("spec"), str):
+            data = merge(data, {"source": {"spec": spec_in(folder, source["spec"])}})
     for override in overrides:
-        data = merge(data, parse_override(override))
+        data = merge(data, parse_override(override, RobotConfig()))
     config = read(RobotConfig(), data, SEE)
     for name, address in (("recording.upload", config.recording.upload), ("map.bucket", config.map.bucket)):
         if address:
@@ -162,30 +170,11 @@ def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> Robot
         raise StereoSfmError(f"map.folder is '{config.map.folder}': name a folder")
     if config.map.bucket and config.map.mode != "localize":
         raise StereoSfmError('map.bucket is for map.mode = "localize": other modes change the map on the robot')
-    return config if file is None else _absolute(config, Path(file).expanduser().resolve().parent)
+    if config.outputs.pose_socket.enabled:
+        Place.read(config.outputs.pose_socket.address)
+    return config if file is None else placed(config, folder)
 
 
 def explain(config: RobotConfig) -> str:
     """The configuration as TOML, with the description of every setting as a comment above it."""
     return explained(config)
-
-
-def _absolute(config: RobotConfig, folder: Path) -> RobotConfig:
-    """With the paths of its sections absolute."""
-
-    def placed(text: str) -> str:
-        return str(folder / Path(text).expanduser()) if text else text
-
-    return dataclasses.replace(
-        config,
-        source=dataclasses.replace(
-            config.source, rig=placed(config.source.rig), camera_store=placed(config.source.camera_store)
-        ),
-        tracking=dataclasses.replace(config.tracking, config=placed(config.tracking.config)),
-        map=dataclasses.replace(config.map, folder=placed(config.map.folder)),
-        recording=dataclasses.replace(config.recording, folder=placed(config.recording.folder)),
-        security=dataclasses.replace(
-            config.security,
-            **{name: placed(getattr(config.security, name)) for name in ("token_file", "tls_cert", "tls_key")},
-        ),
-    )

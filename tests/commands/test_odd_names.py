@@ -24,8 +24,8 @@ from tests.drivers.dataset_folders import make_images
 from tests.maps.maps import small_map
 from tests.synthetic import fisheye_rig
 
-ODD = os.fsdecode(b"caf\xe9")  # of ISO 8859-1
-SHOWN = "caf\N{REPLACEMENT CHARACTER}"
+ODD = os.fsdecode(b"m\xe4rz")  # of ISO 8859-1
+SHOWN = "m\N{REPLACEMENT CHARACTER}rz"
 
 
 @pytest.fixture
@@ -41,8 +41,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("log", ["full", "none"])
 def test_a_run_and_its_report(folder: Path, log: str) -> None:
     assert main(["run", ODD, "--inline", "-q", "--max-lost", "101", "--log", log, "-o", f"out{ODD}"]) == 4
-    assert "caf?" in (folder / f"out{ODD}" / "report.md").read_text("utf-8")
-    assert "caf?" in (folder / f"out{ODD}" / "report.html").read_text("utf-8")
+    assert "m?rz" in (folder / f"out{ODD}" / "report.md").read_text("utf-8")
+    assert "m?rz" in (folder / f"out{ODD}" / "report.html").read_text("utf-8")
     if log == "full":
         with LogReader(folder / f"out{ODD}" / "run.mcap") as reader:
             assert SHOWN in reader.metadata(METADATA)["source"]
@@ -54,13 +54,20 @@ def test_a_recording(folder: Path) -> None:
         assert SHOWN in reader.metadata(METADATA)["source"]
 
 
+def test_a_configuration(folder: Path) -> None:
+    """Its text is in the log."""
+    words = ["run", ODD, "--inline", "-q", "--max-lost", "101", "--set", "loop.enabled=false", "-o", "out"]
+    assert main([*words, "--set", f"loop.vocabulary={ODD}"]) == 4
+    assert "m?rz" in (folder / "out" / "config.toml").read_text("utf-8")
+
+
 def test_tables_and_lines_of_a_log(tmp_path: Path) -> None:
     write_table(tmp_path / "t", ("name",), [[ODD]])
     assert SHOWN in (tmp_path / "t.csv").read_text("utf-8")
     batch.write_results([batch.table_row("a", {"ok": False, "error": f"no {ODD}"})], tmp_path)
     assert SHOWN in (tmp_path / "results.md").read_text("utf-8")
     assert foxglove.text(0, "INFO", f"cannot read {ODD}").message == f"cannot read {SHOWN}"
-    assert printable("caf\N{LATIN SMALL LETTER E WITH ACUTE}") == "caf\N{LATIN SMALL LETTER E WITH ACUTE}"
+    assert printable("m\N{LATIN SMALL LETTER A WITH DIAERESIS}rz") == "m\N{LATIN SMALL LETTER A WITH DIAERESIS}rz"
 
 
 def test_pictures(folder: Path) -> None:

@@ -55,14 +55,17 @@ class Place:
 
     @staticmethod
     def read(text: str) -> Place:
-        """`tcp://ADDRESS:PORT`, or a path.
+        """`tcp://ADDRESS:PORT`, or a path with a slash.
 
         Raises:
             StereoSfmError: neither.
         """
         if not text.startswith("tcp://"):
-            if not text or "://" in text:
-                raise StereoSfmError(f"pose socket '{text}': give tcp://127.0.0.1:7000 or the path of a socket")
+            host, _, port = text.rpartition(":")
+            if "/" not in text and port.isdigit():
+                raise StereoSfmError(f"pose socket '{text}': did you mean tcp://{host or '127.0.0.1'}:{port}?")
+            if "/" not in text or "://" in text:
+                raise StereoSfmError(f"pose socket '{text}': give tcp://127.0.0.1:7000, or a path such as ./{text}")
             return Place(path=Path(text).expanduser())
         host, _, port = text.removeprefix("tcp://").rpartition(":")
         if not host or not port.isdigit() or not 0 <= int(port) <= 65535:

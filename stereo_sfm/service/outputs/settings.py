@@ -15,7 +15,7 @@ class PoseSocketConfig:
     """Poses for other programs, one message each, on a socket."""
 
     enabled: bool = switch(False, "Send poses on a socket")
-    address: str = line("tcp://127.0.0.1:7000", "tcp://ADDRESS:PORT, or the path of a local socket")
+    address: str = path("tcp://ADDRESS:PORT, or the path of a local socket", "tcp://127.0.0.1:7000")
     format: str = word("json", ("json", "protobuf"), "Lines of JSON, or protobuf messages with their length before")
 
 
