@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import os
 import signal
+import socket
 import sys
 from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
+if TYPE_CHECKING:
+    from stereo_sfm.service.config import RobotConfig
+
+log = logging.getLogger("stereo_sfm")
+
+PROBE_S = 2.0  # seconds to wait for the page of a running service
 OTHERS = 0o027  # images show people: files that the service writes are not for other users
 
 
@@ -34,6 +43,16 @@ def override(name: str, text: str) -> str:
     return f"{name}={json.dumps(text, ensure_ascii=False)}"  # a string of JSON is one of TOML
 
 
+def _check_page(config: RobotConfig) -> None:
+    """Warn where nobody answers at the page's port."""
+    page = config.page
+    try:
+        socket.create_connection((page.address, page.port), PROBE_S).close()
+    except OSError:
+        why = "" if page.enabled else ", and page.enabled is false"
+        log.warning("no service answers at %s, port %d%s: the link opens nothing", page.address, page.port, why)
+
+
 def run(args: argparse.Namespace) -> int:
     """Serve until the source ends, SIGTERM or Ctrl-C."""
     from stereo_sfm.pipeline.fork_server import kill_fork_server
@@ -41,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.service.outputs.access import page_link
     from stereo_sfm.service.service import Service
 
-    socket = "outputs.pose_socket"
-    poses = [f"{socket}.enabled=true", override(f"{socket}.address", args.pose_socket)] if args.pose_socket else []
+    section = "outputs.pose_socket"
+    poses = [f"{section}.enabled=true", override(f"{section}.address", args.pose_socket)] if args.pose_socket else []
     source = [override("source.spec", args.source)] if args.source else []
     source += [override("source.rig", str(args.rig.resolve()))] if args.rig else []
     config = load(args.config, [*source, *args.set, *poses])
@@ -53,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     if args.print_link:
         print(page_link(config))
+        _check_page(config)
         return 0
     if args.print_config:
         print(explain(config), end="")
@@ -72,10 +92,11 @@ def run(args: argparse.Namespace) -> int:
         if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):
             signal.signal(number, stop)
     with service:
-        if config.page.enabled and not args.quiet:
-            print(f"the page: {page_link(config)}", flush=True)
-        while not service.wait(1.0):  # a short wait lets signals through
-            pass
+        told = args.quiet
+        while not service.wait(1.0 if told else 0.1):  # a short wait lets signals through
+            if not told and "page" in service.open_outputs:
+                print(f"the page: {page_link(config)}", flush=True)
+                told = True
     kill_fork_server()  # which may still load its code, where the service ended while it started
     if service.error is not None:
         raise service.error

@@ -131,6 +131,11 @@ class Service(Commands):
         return self._hub.on(kind, callback)
 
     @property
+    def open_outputs(self) -> frozenset[str]:
+        """Names of the outputs that clients can reach."""
+        return frozenset(output.name for output in self._hub.outputs if output.wants)
+
+    @property
     def pids(self) -> dict[str, int]:
         """Process ids of stages and outputs by name."""
         session = self._pipelines.session
