@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import logging
 import tomllib
 from collections.abc import Iterator
@@ -16,6 +17,8 @@ from stereo_sfm.errors import StereoSfmError
 log = logging.getLogger("stereo_sfm")
 
 GROUP = "stereo_sfm.drivers"
+MOST_FILES = 10_000  # that are looked at for images
+ABOVE = 3  # folders between the images of one camera and those of both
 _OURS = "stereo-sfm"
 _PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"  # in a checkout; an installed package has none
 
@@ -83,12 +86,30 @@ def recognise(path: Path) -> str:
     """The kind of an existing file or folder: that of the most confident driver.
 
     Raises:
-        StereoSfmError: no driver recognises it.
+        StereoSfmError: no driver recognises it; the message says what it is instead, where that can be told.
     """
+    kind = _recognised(path)
+    if kind is None:
+        others = "'stereo-sfm sources' lists KITTI, EuRoC and all others"
+        raise StereoSfmError(f"{path} is not a known kind of dataset{_instead(path)} ({others})")
+    return kind
+
+
+def _recognised(path: Path) -> str | None:
     certainty = {kind: found.recognise(path) for kind, found in drivers()}
     best = max(certainty, key=certainty.__getitem__, default=None)  # the first of equally confident ones
-    if best is None or certainty[best] is Certainty.NO:
-        known = "; ".join(f"{kind}: {found.summary}" for kind, found in drivers() if found.cameras is None)
-        folders = f": two folders of images are 'images:{path}?left=FOLDER&right=FOLDER'" if path.is_dir() else ""
-        raise StereoSfmError(f"{path} is not a known kind of dataset{folders} (known are {known})")
-    return best
+    return None if best is None or certainty[best] is Certainty.NO else best
+
+
+def _instead(path: Path) -> str:
+    from stereo_sfm.pixels import SUFFIXES
+
+    if (path / "map.json").is_file():
+        return f" but a map: 'stereo-sfm map info {path}' describes it"
+    if not path.is_dir():
+        return ""
+    if not any(p.suffix.lower() in SUFFIXES for p in itertools.islice(path.rglob("*"), MOST_FILES)):
+        return ": there are no images in it"
+    above = next((p for p in path.absolute().parents[:ABOVE] if _recognised(p) is not None), None)
+    near = f", did you mean the folder above, {above}?" if above is not None else ":"
+    return f"{near} two folders of images are 'images:{path}?left=FOLDER&right=FOLDER'"

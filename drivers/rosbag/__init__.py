@@ -24,7 +24,8 @@ def _open(place: str, options: McapOptions) -> Source:
     files = _files(folder) if place and folder.is_dir() and not (folder / "metadata.yaml").is_file() else []
     if len(files) > 1:
         raise StereoSfmError(
-            f"{place} has {len(files)} files and no metadata.yaml: 'ros2 bag reindex {place}' makes one, or run a file"
+            f"{place} has {len(files)} files and no metadata.yaml: 'ros2 bag reindex {place}' makes one of the "
+            f"parts of a bag; of recordings name one, such as {files[0]}"
         )
     if files and files[0].suffix == ".mcap":
         from stereo_sfm.drivers.mcap.source import open_mcap

@@ -99,7 +99,8 @@ def run(args: argparse.Namespace) -> int:
 def _info(folder: Path) -> int:
     from stereo_sfm.maps.saved_map import load_map
 
-    print("\n".join(describe(load_map(folder))))
+    own = folder / "map"  # of a run
+    print("\n".join(describe(load_map(own if (own / "map.json").is_file() else folder))))
     return 0
 
 

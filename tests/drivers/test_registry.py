@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tomllib
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -17,6 +18,7 @@ from stereo_sfm.drivers.driver import Certainty, Driver
 from stereo_sfm.drivers.options import SourceOptions, described, grouped
 from stereo_sfm.drivers.source import is_device, look_up, path_of
 from stereo_sfm.errors import StereoSfmError
+from tests.drivers.dataset_folders import make_euroc, make_images, make_kitti
 
 ROOT = Path(__file__).parents[2]
 
@@ -131,3 +133,34 @@ def test_a_broken_package_hides_no_other_driver(
         assert "'else' (stereo_sfm.drivers.driver:Certainty) is not a stereo_sfm.drivers.driver.Driver" in caplog.text
     finally:
         registry.driver.cache_clear()
+
+
+def _said(path: Path) -> str:
+    with pytest.raises(StereoSfmError, match="is not a known kind of dataset") as error:
+        registry.recognise(path)
+    assert len(str(error.value)) < 220 + 3 * len(str(path))
+    return str(error.value)
+
+
+@pytest.mark.parametrize("make", [make_images, make_euroc, make_kitti])
+def test_one_of_two_cameras_leads_to_the_folder_above(make: Callable[[Path], Path], tmp_path: Path) -> None:
+    root = make(tmp_path / "data")
+    for folder in {path.parent for path in root.rglob("*.png")}:
+        assert "did you mean the folder above, " in _said(folder)
+        above = Path(_said(folder).rpartition("above, ")[2].partition("?")[0])
+        assert root in (above, *above.parents) and registry.recognise(above)
+
+
+def test_what_is_no_dataset_is_told_what_it_is(tmp_path: Path) -> None:
+    (tmp_path / "empty" / "left").mkdir(parents=True)
+    assert "there are no images in it" in _said(tmp_path / "empty")
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "map.json").touch()
+    assert f"but a map: 'stereo-sfm map info {tmp_path / 'map'}'" in _said(tmp_path / "map")
+
+
+def test_two_recordings_are_no_parts_of_a_bag(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).touch()
+    with pytest.raises(StereoSfmError, match=f"name one, such as {tmp_path}/a.mcap"):
+        open_source(tmp_path)

@@ -228,4 +228,6 @@ def test_map_info_on_the_command_line(tmp_path: Path, saved: SavedMap, capsys: p
     assert f"{len(saved)} keyframes, {len(saved.snapshot.pt_ids)} points" in out
     assert "kannala_brandt 848x800, baseline 64.0 mm" in out
     assert main(["map", "info", str(tmp_path)]) == 2
+    (tmp_path / "m").rename(tmp_path / "map")  # as in the folder of a run
+    assert main(["map", "info", str(tmp_path)]) == 0
     assert "no map at" in capsys.readouterr().err
