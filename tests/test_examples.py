@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import runpy
 import socket
 import subprocess
@@ -42,3 +43,23 @@ def test_a_client_without_a_service_ends_with_one_line(tmp_path: Path) -> None:
         client = subprocess.Popen([*command, str(place)], stderr=subprocess.PIPE, text=True)
         server.accept()[0].close()
         assert len(client.communicate()[1].splitlines()) == 1 and client.returncode == 1
+
+
+def test_a_client_whose_reader_has_enough_says_nothing(tmp_path: Path) -> None:
+    """As `client.py | head -1`."""
+    place, pose = tmp_path / "poses", {"unix_ns": 1, "state": "OK", "map_position": [0, 0, 0], "latency_ms": 1.0}
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(place))
+        server.listen()
+        command = [sys.executable, str(EXAMPLES[0].parent / "pose_client" / "client.py"), str(place)]
+        client = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert client.stdout is not None and client.stderr is not None
+        connection = server.accept()[0]
+        line = json.dumps(pose).encode() + b"\n"
+        connection.sendall(line)
+        assert client.stdout.readline().startswith("1 OK")
+        client.stdout.close()
+        connection.sendall(line)
+        assert (client.wait(), client.stderr.read()) == (0, "")
+        client.stderr.close()
+        connection.close()

@@ -1,6 +1,7 @@
 """Prints the poses of a running service: client.py [PORT | SOCKET] [TOKEN_FILE]."""
 
 import json
+import os
 import socket
 import sys
 from pathlib import Path
@@ -10,15 +11,17 @@ token = Path(sys.argv[2]) if len(sys.argv) > 2 else Path.home() / ".local/state/
 connection = socket.socket(socket.AF_INET if place.isdigit() else socket.AF_UNIX)
 try:
     connection.connect(("127.0.0.1", int(place)) if place.isdigit() else place)
+    if token.exists():
+        connection.sendall(token.read_bytes())
 except (OSError, OverflowError) as error:
     sys.exit(f"no service at {place}: {getattr(error, 'strerror', error)}")
 try:
-    if token.exists():
-        connection.sendall(token.read_bytes())
     for line in connection.makefile():
         pose = json.loads(line)
         where = (f"{v:.3f}" for v in pose["map_position"])
-        print(pose["unix_ns"], pose["state"], *where, f"{pose['latency_ms']:.1f} ms")
+        print(pose["unix_ns"], pose["state"], *where, f"{pose['latency_ms']:.1f} ms", flush=True)
+except BrokenPipeError:  # of standard output, as of `client.py | head`
+    os._exit(0)
 except OSError as error:
     sys.exit(f"the service at {place} has closed the connection: {error.strerror}")
 except KeyboardInterrupt:
