@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         folder / "map" for folder in folders if (folder / "map" / "map.json").exists() and results[str(folder)]["ok"]
     ]
     if merging and len(maps) > 1:
-        print(batch.merge_maps(maps, config, args.output / "map"))
+        print(batch.merge_maps(maps, config, args.output / batch.MAP))
     return SOME_FAILED if any(not r["ok"] for r in results.values()) else 0
 
 

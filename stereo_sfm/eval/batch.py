@@ -22,6 +22,7 @@ from stereo_sfm.input_file import read_json
 from stereo_sfm.jobs import Job, Limits, run_jobs
 
 RESULT = "result.json"
+MAP = "map"  # folder of the merged map, beside those of the recordings
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,11 @@ class BatchTask:
 def names(recordings: Sequence[str]) -> list[str]:
     """A unique folder name for each recording, in order: of characters that need no quotes in a shell."""
     stems = [re.sub(r"[^\w.-]+", "_", Path(r).stem or r).strip("_") for r in recordings]
-    taken = {s for s in stems if stems.count(s) == 1}
+    taken = {s for s in stems if stems.count(s) == 1} | {MAP}
     out: list[str] = []
     for stem in stems:
         name = stem
-        if stems.count(stem) > 1:
+        if stems.count(stem) > 1 or stem == MAP:
             name = next(f"{stem}_{k}" for k in count(1) if f"{stem}_{k}" not in taken)
             taken.add(name)
         out.append(name)
@@ -166,7 +167,7 @@ def write_results(rows: Sequence[Sequence[Any]], folder: Path) -> None:
 def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:
     """Merge the maps of all sessions that loops connect; returns a line about the result."""
     from stereo_sfm.loop.vocabulary_file import configured_vocabulary
-    from stereo_sfm.maps.merge import merge
+    from stereo_sfm.maps.merge import merge, share_a_session
     from stereo_sfm.maps.saved_map import load_map, save_map
 
     vocabulary = configured_vocabulary(config.loop)
@@ -174,7 +175,10 @@ def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:
     joined, alone = [folders[0].parent.name], list[str]()
     for folder in folders[1:]:
         try:
-            common = merge([common, load_map(folder)], vocabulary, config.loop, config.mapper).saved
+            other = load_map(folder)
+            if share_a_session(common, other):
+                raise StereoSfmError("the same recording as one before")
+            common = merge([common, other], vocabulary, config.loop, config.mapper).saved
             joined.append(folder.parent.name)
         except StereoSfmError as error:
             alone.append(f"{folder.parent.name} ({error})")

@@ -11,8 +11,11 @@ import pytest
 
 from stereo_sfm.calib import save_rig
 from stereo_sfm.cli import main
-from stereo_sfm.eval.batch import names
+from stereo_sfm.config import Config
+from stereo_sfm.eval.batch import merge_maps, names
+from stereo_sfm.maps.saved_map import load_map, save_map
 from tests.drivers.dataset_folders import make_euroc, make_images, make_kitti, make_tum_rgbd
+from tests.maps.maps import small_map
 from tests.synthetic import fisheye_rig
 
 Outcome = tuple[int, str, str]
@@ -525,3 +528,18 @@ def test_an_impossible_calibration(cli: Run, tmp_path: Path, line: str, message:
     root = make_kitti(tmp_path / "k")
     (root / "sequences" / "00" / "calib.txt").write_text(f"P0: 50 0 32 0 0 50 24 0 0 0 1 0\n{line}\n")
     assert_one_line(cli("run", root), message)
+
+
+def test_a_recording_called_map_is_not_where_the_maps_are_merged() -> None:
+    assert names(["b/map.mcap", "b/two.mcap"]) == ["map_1", "two"]
+    assert names(["a/map.mcap", "b/map.mcap", "map_1.mcap"]) == ["map_2", "map_3", "map_1"]
+    assert names(["a/x.mcap", "b/x.mcap", "y"]) == ["x_1", "x_2", "y"]
+
+
+def test_two_copies_of_a_recording_are_not_merged(tmp_path: Path) -> None:
+    maps = [tmp_path / name / "map" for name in ("one", "copy")]
+    for folder in maps:
+        save_map(small_map()[1], folder)
+    said = merge_maps(maps, Config(), tmp_path / "map")
+    assert "one map of one:" in said and "not connected: copy (the same recording as one before)" in said
+    assert len(load_map(tmp_path / "map")) == len(small_map()[1])
