@@ -51,6 +51,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.service",
     "stereo_sfm.commands",
     "stereo_sfm.cli",
+    "stereo_sfm.__main__",
 )
 CORE = (
     "stereo_sfm.geometry",

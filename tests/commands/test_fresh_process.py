@@ -24,3 +24,8 @@ def run(folder: Path, *options: str) -> dict[str, Any]:
 def test_a_run_gives_the_same_in_one_process_and_in_many(tmp_path: Path) -> None:
     one, many = run(tmp_path / "one", "--inline"), run(tmp_path / "many")
     assert one["fingerprint"] == many["fingerprint"] and one["keyframes"] == many["keyframes"]
+
+
+def test_the_package_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "stereo_sfm", "sources"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "euroc" in done.stdout
