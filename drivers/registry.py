@@ -86,7 +86,7 @@ def recognise(path: Path) -> str:
     """The kind of an existing file or folder: that of the most confident driver.
 
     Raises:
-        StereoSfmError: no driver recognises it; the message says what it is instead, where that can be told.
+        StereoSfmError: no driver recognises it; the message says what it is instead, where that is known.
     """
     kind = _recognised(path)
     if kind is None:

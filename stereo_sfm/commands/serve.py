@@ -92,11 +92,11 @@ def run(args: argparse.Namespace) -> int:
         if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):
             signal.signal(number, stop)
     with service:
-        told = args.quiet
-        while not service.wait(1.0 if told else 0.1):  # a short wait lets signals through
-            if not told and "page" in service.open_outputs:
+        printed = args.quiet
+        while not service.wait(1.0 if printed else 0.1):  # a short wait lets signals through
+            if not printed and "page" in service.open_outputs:
                 print(f"the page: {page_link(config)}", flush=True)
-                told = True
+                printed = True
     kill_fork_server()  # which may still load its code, where the service ended while it started
     if service.error is not None:
         raise service.error
