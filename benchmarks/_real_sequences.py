@@ -99,6 +99,10 @@ _AS_THEY_ARE = (
     # Of SihanWang-WHU/Stereo_VO and BhavyanshM/StereoVisualOdometry, laid out as KITTI; the car drives at each start.
     Sequence("kitti_03", "kitti_03/sequences/03", starts_s=(0.0, 1.0, 2.0, 3.0, 4.8, 5.0, 5.4)),
     Sequence("kitti_00_start", "kitti_00_start/sequences/00", starts_s=(0.0, 1.0, 2.0, 3.0, 5.0)),
+    # Of feixyz10/oh_my_vslam (frames 100 to 159), and in the histories of petercorke/RVC3-MATLAB and HustRobot/VSLAM.
+    Sequence("kitti_05_part", "kitti_05_part/sequences/05", starts_s=(0.0, 0.1, 0.2, 0.3, 0.4)),
+    Sequence("daimler_bridge", "daimler_bridge", starts_s=(0.0, 1.0, 2.0, 3.0, 5.0)),
+    Sequence("fr1_desk", "rgbd_dataset_freiburg1_desk", starts_s=(0.0, 2.0, 4.0, 6.0, 8.0), kind="depth"),
     Sequence("karlsruhe_part", "karlsruhe_part", rate_hz=9.5, shared=True),
     Sequence("kitti_00_part", "kitti", rate_hz=9.65, shared=True, best_cpp="0.319 m", long=True),
     Sequence("euroc_mh01_part", "euroc_mh01", rate_hz=20.0, shared=True, kind="inertial", best_cpp="4.6 mm", long=True),

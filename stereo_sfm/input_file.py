@@ -98,7 +98,7 @@ def refuse_pipe(path: Path) -> None:
     Raises:
         StereoSfmError: it is such a pipe.
     """
-    if path.resolve().is_fifo():
+    if Path(os.path.realpath(path)).is_fifo():  # of links that go round nothing is said here
         raise StereoSfmError(f"cannot use {path}: it is not a file but a pipe")
 
 
