@@ -198,41 +198,31 @@ def path_of(spec: str) -> Path:
     return Path(head.partition(":")[2] if _kind(spec) else spec if Path(spec).exists() else head).expanduser()
 
 
-def absolute(spec: str, driver: Driver[Any]) -> str:
+def absolute(spec: str, driver: Driver[Any] | None = None, folder: Path = Path()) -> str:
     """A source's text with absolute paths of what exists: its file or folder, and the files of its options.
 
     Args:
-        spec: as for `open_source`. driver: which opens it.
+        spec: as for `open_source`. driver: which opens it; None: that of its kind. folder: from which its paths are.
     """
-    if _kind(spec) is None and Path(spec).expanduser().exists():
-        return _absolute(spec)
+    kind = _kind(spec)
+    if kind is None and (folder / Path(spec).expanduser()).exists():
+        return _absolute(spec, folder)
+    driver = registry.driver(kind) if driver is None and kind is not None else driver
     head, mark, query = spec.partition("?")
-    kind, colon, named = head.partition(":") if _kind(spec) else ("", "", head)
-    there = _absolute(named) if driver.of_files else named
+    name, colon, named = head.partition(":") if kind else ("", "", head)
+    there = _absolute(named, folder) if driver is None or driver.of_files else named
     if "?" in there:  # what follows would be taken for options
         return spec
-    files = {one.name for one in fields(driver.options) if one.metadata.get("file")}
+    files = set[str]() if driver is None else {one.name for one in fields(driver.options) if one.metadata.get("file")}
     parts = [part.partition("=") for part in query.split("&")]
-    options = [f"{name}={quote(_absolute(unquote_plus(text)))}" if name in files else f"{name}{equals}{text}"
-               for name, equals, text in parts]  # fmt: skip
-    return f"{kind}{colon}{there}{mark}{'&'.join(options)}"
+    options = [f"{key}={quote(_absolute(unquote_plus(text), folder))}" if key in files else f"{key}{equals}{text}"
+               for key, equals, text in parts]  # fmt: skip
+    return f"{name}{colon}{there}{mark}{'&'.join(options)}"
 
 
-def _absolute(text: str) -> str:
-    path = Path(text).expanduser()
+def _absolute(text: str, folder: Path) -> str:
+    path = folder / Path(text).expanduser()
     return str(path.resolve()) if text and not is_uri(text) and path.exists() else text
-
-
-def spec_in(folder: Path, spec: str) -> str:
-    """The text of a source with its file or folder, where that is in `folder`, from there."""
-    head, mark, query = spec.partition("?")
-    kind, colon, place = head.partition(":")
-    if kind not in registry.kinds():
-        kind, colon, place = "", "", head
-    elif not registry.driver(kind).place.startswith(("FOLDER", "FILE")):
-        return spec
-    there = folder / Path(place).expanduser()
-    return f"{kind}{colon}{there}{mark}{query}" if place and there.exists() else spec
 
 
 def _kind(text: str) -> str | None:

@@ -149,7 +149,7 @@ def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> Robot
     Raises:
         StereoSfmError: the file cannot be read, has an unknown key, or a value that its setting does not take.
     """
-    from stereo_sfm.drivers.source import spec_in
+    from stereo_sfm.drivers.source import absolute
     from stereo_sfm.service.outputs.pose_socket import Place
 
     data: dict[str, Any] = {}
@@ -158,7 +158,7 @@ def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> Robot
         data = read_toml(Path(file).expanduser(), SEE)
         source = data.get("source")
         if isinstance(source, dict) and isinstance(source.get("spec"), str):
-            data = merge(data, {"source": {"spec": spec_in(folder, source["spec"])}})
+            data = merge(data, {"source": {"spec": absolute(source["spec"], folder=folder)}})
     for override in overrides:
         data = merge(data, parse_override(override, RobotConfig()))
     config = read(RobotConfig(), data, SEE)
