@@ -101,11 +101,10 @@ class OutputProcess:
         self._closing.set()
         if self._outbox is not None:
             self._outbox.close()
-        if self._process is not None:
-            if self.wants:  # else it is not open yet, and has nothing to close
-                self._process.join(END_S)
-            if self._process.is_alive():
-                self._process.kill()
+        if self.wants:  # else it is not open yet, and has nothing to close
+            self._thread.join(END_S)
+        if self._process is not None and self._thread.is_alive():
+            self._process.kill()
         self._thread.join(END_S)
         self._pool.shutdown(wait=False, cancel_futures=True)
 

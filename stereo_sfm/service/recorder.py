@@ -65,6 +65,7 @@ class Recorder:
         self.state = RecorderState("", "", 0, 0, "")
         self._lock = threading.RLock()
         self._process: BaseProcess | None = None
+        self._listener: threading.Thread | None = None  # the only one that waits for the process's end
         self._outbox: DroppingOutbox | None = None
         self._closing = False
         self._over = threading.Event()
@@ -167,7 +168,8 @@ class Recorder:
         (messages, send), (reports, to_main) = pipe(), pipe()
         process = start_child("recorder", run_recorder, messages, to_main)
         self._process, self._outbox, self._started_s = process, DroppingOutbox(send, WAITING), time.monotonic()
-        threading.Thread(target=self._listen, args=(process, reports), name="recorder", daemon=True).start()
+        self._listener = threading.Thread(target=self._listen, args=(process, reports), name="recorder", daemon=True)
+        self._listener.start()
 
     def _listen(self, process: BaseProcess, reports: Connection) -> None:
         follow("recorder", process, reports, self._take)
@@ -210,14 +212,14 @@ class Recorder:
         with self._lock:
             self._closing = True
             self._over.set()
-            process, outbox = self._process, self._outbox
+            process, listener, outbox = self._process, self._listener, self._outbox
         if outbox is not None:
             outbox.close()
-        if process is not None:
+        if process is not None and listener is not None:
             if self.state.recording or self._number:  # else there is nothing to write
-                process.join(CLOSE_S + 0.5)
-            if process.is_alive():
+                listener.join(CLOSE_S + 0.5)
+            if listener.is_alive():
                 if self.state.recording:
                     log.warning("the recorder did not end in time: the last seconds may be missing")
                 process.kill()
-                process.join()
+                listener.join()

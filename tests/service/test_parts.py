@@ -378,9 +378,28 @@ def test_a_recorder_that_dies_at_its_start_is_not_started_all_the_time(monkeypat
 
 @pytest.mark.parametrize("recording", [False, True])
 def test_a_recorder_with_nothing_to_write_is_not_missed(recording: bool, caplog: pytest.LogCaptureFixture) -> None:
-    process = SimpleNamespace(join=lambda *_: None, is_alive=lambda: True, kill=lambda: None)
+    listener = SimpleNamespace(join=lambda *_: None, is_alive=lambda: True)
     recorder = Recorder(RecordingConfig())
-    recorder._process = cast(Any, process)  # pyright: ignore[reportPrivateUsage]
+    recorder._process = cast(Any, SimpleNamespace(kill=lambda: None))  # pyright: ignore[reportPrivateUsage]
+    recorder._listener = cast(Any, listener)  # pyright: ignore[reportPrivateUsage]
     recorder.state = dataclasses.replace(recorder.state, recording=recording)
     recorder.close()
     assert ("did not end in time" in caplog.text) == recording
+
+
+def test_the_end_of_a_recorder_that_is_noticed_late_is_not_taken_for_none(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    recorder, reaped = Recorder(RecordingConfig(mode="full")), os.waitpid
+
+    def slow(pid: int, options: int) -> tuple[int, int]:
+        time.sleep(0.2 if threading.current_thread() is threading.main_thread() else 0.0)
+        result = reaped(pid, options)
+        time.sleep(0.5)  # of a busy machine, before this thread can tell what it knows
+        return result
+
+    recorder.start()
+    monkeypatch.setattr(os, "waitpid", slow)
+    recorder.state, recorder._number = dataclasses.replace(recorder.state, recording=True), 1  # pyright: ignore
+    recorder.close()
+    assert "did not end in time" not in caplog.text
