@@ -3,13 +3,13 @@
     python -m benchmarks kills -- [--count 100] [--busy N] [--stages tracker,mapper]
 
 The service plays the bundled recording again and again at its rate. Printed are the seconds from each kill to the next
-pose, their median and largest, how many took at most 3 s, how long SIGTERM's work took at the end, and poses that the
-recordings lack. `--busy` starts that many loops; a fifth as many stages, one at least, are killed before that, for the
+pose, their median and largest, how many took at most 3 s, how long SIGTERM's work took at the end, and poses and images
+that the recordings lack. `--busy` starts that many loops; a fifth as many stages, one at least, are killed before that, for the
 figure of the quiet machine. Where a kill costs no session, as a loop closer's does, poses go on meanwhile: its seconds
 are those to the next pose after the stage runs again, and the others are counted alone, too.
 
-The exit code is 1 if more than 5 % took longer beside the loops (without `--busy`: at all), if a pose is not in the
-recordings that came more than a second before or after a kill, or if no map was saved.
+The exit code is 1 if more than 5 % took longer beside the loops (without `--busy`: at all), if a pose or its image is not in
+the recordings that came more than a second before or after a kill, or if no map was saved.
 """
 
 from __future__ import annotations
@@ -77,18 +77,17 @@ class Poses:
             return self.came.wait_for(lambda: self.count >= until, GIVE_UP_S)
 
 
-def logged(root: Path) -> list[tuple[float, set[int]]]:
-    """Of each recording with frames: the monotonic time at which the middle one was written, and the frames."""
-    from stereo_sfm.log import topics
+def logged(root: Path, *wanted: str) -> list[tuple[float, set[int]]]:
+    """Of each recording with messages of topics: the monotonic time at which the middle one was written, and frames."""
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.recording.segments import recordings, segments
 
     out, began_ns = list[tuple[float, set[int]]](), time.time_ns() - time.monotonic_ns()
     for folder in recordings(root):
         written = list[tuple[int, int]]()
-        for segment in segments(folder):
-            with LogReader(segment.poses) as reader:
-                written += [(record.publish_time, record.sequence) for record in reader.messages([topics.FRAME])]
+        for path in (path for s in segments(folder) for path in (s.poses, s.images) if path.exists()):
+            with LogReader(path) as reader:
+                written += [(record.publish_time, record.sequence) for record in reader.messages(wanted)]
         if written:
             middle_ns = statistics.median(ns for ns, _ in written)
             out.append(((middle_ns - began_ns) / 1e9, {frame for _, frame in written}))
@@ -96,7 +95,7 @@ def logged(root: Path) -> list[tuple[float, set[int]]]:
 
 
 def missing(poses: Mapping[tuple[int, int], float], found: Sequence[tuple[float, set[int]]]) -> list[float]:
-    """When the poses came that no recording of their session has. A recording is of the newest session of its time."""
+    """When the poses came whose frames no recording of their session has. A recording is of its time's newest session."""
     begins: dict[int, float] = {}
     for (session, _), at_s in poses.items():
         begins[session] = min(at_s, begins.get(session, at_s))
@@ -155,6 +154,7 @@ def summary(name: str, kills: Sequence[Kill]) -> str:
 
 
 def main(args: list[str] | None = None) -> int:
+    from stereo_sfm.log import topics
     from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig, SourceConfig
     from stereo_sfm.service.messages import PoseUpdate
     from stereo_sfm.service.service import Service
@@ -168,7 +168,7 @@ def main(args: list[str] | None = None) -> int:
         root = Path(place) / "recordings"
         config = RobotConfig(
             source=SourceConfig(str(DEMO), repeat=True), map=MapConfig(str(Path(place) / "store"), save_every_min=0.2),
-            recording=RecordingConfig(str(root), "lean"),
+            recording=RecordingConfig(str(root), "full"),
         )  # fmt: skip
         poses, quiet, stages = Poses(), list[Kill](), o.stages.split(",")
         with Service(config) as service:
@@ -182,15 +182,18 @@ def main(args: list[str] | None = None) -> int:
             kills = kill_stages(service, poses, stages, o.count)
             began = time.monotonic()
         ended_s = time.monotonic() - began
-        lost = missing(poses.at_s, logged(root))
+        lost = missing(poses.at_s, logged(root, topics.FRAME))
+        unseen = missing(poses.at_s, logged(root, topics.LEFT_IMAGE, topics.DROPPED))
+        dropped = sum(len(frames) for _, frames in logged(root, topics.DROPPED))
         saved = (Path(place) / "store" / "map.json").exists()
     if quiet:
         print(summary("quiet", quiet))
     print(summary(f"beside {o.busy} busy loops" if o.busy else "quiet", kills))
-    wrong = beyond(lost, quiet + kills)
+    poseless, imageless = beyond(lost, quiet + kills), beyond(unseen, quiet + kills)
     print(f"load {os.getloadavg()[0]:.1f}; ended in {ended_s:.1f} s, map saved: {saved}; recordings lack "
-          f"{len(lost)} of {len(poses.at_s)} poses, {wrong} of these beyond a second from a kill")  # fmt: skip
-    return int(good(kills) < SHARE * len(kills) or wrong > 0 or not saved)
+          f"{len(lost)} of {len(poses.at_s)} poses, {poseless} of these beyond a second from a kill, and {len(unseen)} "
+          f"images, {imageless} of these; {dropped} images were dropped, and the recordings say so")  # fmt: skip
+    return int(good(kills) < SHARE * len(kills) or poseless + imageless > 0 or not saved)
 
 
 if __name__ == "__main__":

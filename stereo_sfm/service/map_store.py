@@ -28,7 +28,7 @@ from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.maps.growing import GrowingMap
 from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.saved_map import load_map, save_map
-from stereo_sfm.maps.store import lock
+from stereo_sfm.maps.store import lock, lock_versioned
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
 from stereo_sfm.pipeline.allocator import release_memory, return_large_blocks, share_one_heap
 from stereo_sfm.pipeline.child import raise_priority
@@ -106,13 +106,15 @@ class MapStore:
             return MapFolders()
         if self.saves and self._lock is None:
             self._lock = lock(self.folder)
-        for replaced in (self.folder, self.session, base):
-            recover(replaced)
         if self.mode == "localize":
+            with contextlib.suppress(StereoSfmError), lock_versioned(self.folder):  # else another process writes to it
+                recover(self.folder)
             folders = MapFolders(map_in=self.folder, localize_only=True)
             folders.check()
             self.saved_ns = (self.folder / "map.json").stat().st_mtime_ns
             return folders
+        for replaced in (self.folder, self.session, base):
+            recover(replaced)
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         if self._fresh:
             if not self._join_left_over(base, stopped):

@@ -51,6 +51,18 @@ def keeper(tmp_path: Path) -> MapKeeper:
     return made
 
 
+@pytest.mark.parametrize("written", [False, True])
+def test_who_only_localizes_leaves_what_another_is_writing(tmp_path: Path, written: bool) -> None:
+    store, draft = tmp_path / "store", tmp_path / ".store.partial"
+    save_map(small_map()[1], store)
+    held = lock(store)
+    draft.mkdir()
+    if not written:
+        held.release()  # its writer was killed
+    folders = MapKeeper(MapConfig(str(store), "localize"), Config()).begin()
+    assert folders.map_in == store and draft.exists() == written
+
+
 def test_the_service_is_the_only_writer_of_the_map_that_it_extends(tmp_path: Path) -> None:
     maps = keeper(tmp_path)
     with pytest.raises(StereoSfmError, match="stop the service"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hmac
 import json
 import math
@@ -28,6 +29,7 @@ from stereo_sfm.log import schema
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.outputs import pose_socket
 from stereo_sfm.service.outputs.access import WRONG_AT_ONCE, Access, access
+from stereo_sfm.service.outputs.door import Door, Visit
 from stereo_sfm.service.outputs.pose_message import MISSED_FIELD, PoseMessage
 from stereo_sfm.service.outputs.pose_socket import MOST_CLIENTS, Place, PoseSocket
 from stereo_sfm.service.outputs.settings import OutputsConfig, PoseSocketConfig, SecurityConfig
@@ -231,6 +233,28 @@ def test_more_clients_than_allowed_are_turned_away() -> None:
         assert _clients(output) == MOST_CLIENTS - 1  # who has gone is forgotten
         for client in clients:
             client.close()
+
+
+@pytest.mark.parametrize("rules", [Access(), Access(TOKEN)])
+def test_too_many_open_files_end_no_socket(monkeypatch: pytest.MonkeyPatch, rules: Access) -> None:
+    accepted, refused = Door.visitor, [OSError(errno.EMFILE, "Too many open files")] * 2
+
+    def visitor(door: Door) -> Visit:
+        visit = accepted(door)
+        if refused:
+            visit.socket.close()
+            raise refused.pop()
+        return visit
+
+    monkeypatch.setattr(Door, "visitor", visitor)
+    with _listening(rules=rules) as output:
+        for _ in range(2):
+            with socket.create_connection(("127.0.0.1", output.port), 5) as client:
+                client.sendall(TOKEN.encode() + b"\n")
+                assert not _read_all(client)
+        with socket.create_connection(("127.0.0.1", output.port), 5) as client:
+            client.sendall(TOKEN.encode() + b"\n")
+            _until(lambda: _clients(output) == 1)
 
 
 def test_a_local_socket_is_taken_over_from_a_dead_service(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ BUFFER_BYTES = 1 << 16  # of the system for one client: a slow one is not far be
 HTTP = " HTTP/1.0", " HTTP/1.1"  # how the first line of a request ends
 HANDSHAKE_BYTES = 4200
 SOCKET_MODE = 0o660
+AGAIN_S = 0.1  # until the next connection is accepted where the system refused one
 
 
 def make(config: RobotConfig) -> PoseSocket:
@@ -198,12 +199,16 @@ class PoseSocket:
             self._server.leave(visit)
 
     def _accept(self, door: Door) -> None:
-        while True:
+        while door.fileno() >= 0:
             try:
                 visit = door.visitor()
-            except OSError:
-                return
-            threading.Thread(target=self._authenticate, args=(door, visit), daemon=True).start()
+            except OSError:  # it is closed, or there are too many open files
+                time.sleep(AGAIN_S)
+                continue
+            if self._rules.token or self._rules.tls is not None:
+                threading.Thread(target=self._authenticate, args=(door, visit), daemon=True).start()
+            else:  # nothing to wait for
+                self._authenticate(door, visit)
 
     def _authenticate(self, door: Door, visit: Visit) -> None:
         """TLS handshake and token, where they are needed; then the client gets poses."""
