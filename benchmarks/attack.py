@@ -382,8 +382,8 @@ def stopped_processes(t: Target) -> Outcome:
                     env=_environment(Path(name)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
                     process_group=0,
                 )  # fmt: skip
-                until = time.monotonic() + START_S
-                while len(_group(process.pid)) < min(k + 4, 1 + PROCESSES) and process.poll() is None and time.monotonic() < until:
+                until, count = time.monotonic() + START_S, min(k + 4, 1 + PROCESSES)
+                while len(_group(process.pid)) < count and process.poll() is None and time.monotonic() < until:
                     time.sleep(0.01)
                 found = sorted(set(_group(process.pid)) - {process.pid})
                 if k < len(found):
@@ -399,7 +399,8 @@ def stopped_processes(t: Target) -> Outcome:
                 slowest = max(slowest, time.monotonic() - begin)
                 if "Traceback" in said:
                     wrong.append(f"{number.name} of process {k}: {said.strip()[-80:]}")
-    return f"{2 * PROCESSES} processes, the slowest end {slowest:.1f} s {'; '.join(wrong)}", not wrong and slowest <= 2 * STOP_S
+    text = f"{2 * PROCESSES} processes, the slowest end {slowest:.1f} s {'; '.join(wrong)}"
+    return text, not wrong and slowest <= 2 * STOP_S
 
 
 def _group(leader: int) -> list[int]:

@@ -3,13 +3,13 @@
     python -m benchmarks kills -- [--count 100] [--busy N] [--stages tracker,mapper]
 
 The service plays the bundled recording again and again at its rate. Printed are the seconds from each kill to the next
-pose, their median and largest, how many took at most 3 s, how long SIGTERM's work took at the end, and poses and images
-that the recordings lack. `--busy` starts that many loops; a fifth as many stages, one at least, are killed before that, for the
-figure of the quiet machine. Where a kill costs no session, as a loop closer's does, poses go on meanwhile: its seconds
-are those to the next pose after the stage runs again, and the others are counted alone, too.
+pose, their median and largest, how many took at most 3 s, how long SIGTERM's work took at the end, and the poses and
+images that the recordings lack. `--busy` starts that many loops; a fifth as many stages, one at least, are killed
+before that, for the figure of the quiet machine. Where a kill costs no session, as a loop closer's does, poses go on
+meanwhile: its seconds are those to the next pose after the stage runs again, and the others are counted alone, too.
 
-The exit code is 1 if more than 5 % took longer beside the loops (without `--busy`: at all), if a pose or its image is not in
-the recordings that came more than a second before or after a kill, or if no map was saved.
+The exit code is 1 if more than 5 % took longer beside the loops (without `--busy`: at all), if a pose or its image is
+not in the recordings that came more than a second before or after a kill, or if no map was saved.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def logged(root: Path, *wanted: str) -> list[tuple[float, set[int]]]:
 
 
 def missing(poses: Mapping[tuple[int, int], float], found: Sequence[tuple[float, set[int]]]) -> list[float]:
-    """When the poses came whose frames no recording of their session has. A recording is of its time's newest session."""
+    """When the poses came whose frames no recording of their session has; a recording is of the newest of its time."""
     begins: dict[int, float] = {}
     for (session, _), at_s in poses.items():
         begins[session] = min(at_s, begins.get(session, at_s))
