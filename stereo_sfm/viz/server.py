@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import importlib.util
 import os
 import shutil
@@ -44,7 +45,8 @@ def serve(address: str) -> tuple[str, str]:
     _check_free(address, GRPC_PORT, WEB_PORT)
     ports = ("--port", str(GRPC_PORT), "--web-viewer-port", str(WEB_PORT))
     options = ("--serve-web", "--bind", address, *ports, "--server-memory-limit", MEMORY_LIMIT)
-    process = subprocess.Popen([_executable(), *options], **_SILENT, preexec_fn=end_with_parent)
+    end_with_us = functools.partial(end_with_parent, os.getpid())
+    process = subprocess.Popen([_executable(), *options], **_SILENT, preexec_fn=end_with_us)
     here = LOOPBACK if address in EVERYWHERE else address
     _wait_for(process, here, GRPC_PORT, WEB_PORT)
     host = socket.gethostname() if address in EVERYWHERE else address
@@ -80,10 +82,15 @@ def _executable() -> str:
     return viewer
 
 
-def end_with_parent() -> None:
-    """In a child that is another program: end with the thread that started it, however that ends (Linux)."""
+def end_with_parent(parent: int) -> None:
+    """In a child that is another program: end with the thread that started it, however that ends (Linux).
+
+    Args: parent, number of the process that started it, which may have ended already.
+    """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 def _wait_for(process: subprocess.Popen[Any], address: str, *ports: int) -> None:

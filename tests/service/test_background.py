@@ -33,6 +33,7 @@ def wait_for(what: str, ready: Callable[[], object], seconds: float = 30.0) -> N
         time.sleep(0.05)
 
 
+@pytest.mark.usefixtures("beside")
 @pytest.mark.skipif(sys.platform != "linux", reason="prctl")
 def test_a_command_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> None:
     """Also if that is killed: nobody would read what it prints."""
@@ -44,6 +45,12 @@ def test_a_command_ends_with_the_process_that_waits_for_it(tmp_path: Path) -> No
         waiting.send_signal(signal.SIGKILL)
         waiting.wait()
     wait_for("the command ends", lambda: process_state(command) in ("", "Z"))
+
+
+def test_a_command_ends_whose_starter_was_killed_before_it_could_be_watched() -> None:
+    late = "import os; from stereo_sfm.viz.server import end_with_parent; end_with_parent(os.getppid() + {}); print(1)"
+    done = [subprocess.run([sys.executable, "-c", late.format(k)], capture_output=True).stdout for k in (0, 1)]
+    assert done == [b"1\n", b""]
 
 
 def test_a_command_that_fails_says_why_from_its_beginning(tmp_path: Path) -> None:

@@ -92,6 +92,7 @@ def _endless(*_: object) -> None:
     time.sleep(600.0)
 
 
+@pytest.mark.usefixtures("beside")
 @pytest.mark.parametrize("ended", ["stopped", "killed"])
 def test_a_left_over_session_holds_no_stop_up_and_is_not_lost(
     ended: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -303,6 +304,7 @@ def _work() -> None:
     time.sleep(600.0)
 
 
+@pytest.mark.usefixtures("beside")
 def test_the_process_that_saves_ends_with_the_service() -> None:
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(False)

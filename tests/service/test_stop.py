@@ -78,6 +78,7 @@ def test_an_output_that_is_not_open_yet_is_not_waited_for(monkeypatch: pytest.Mo
     assert process.killed and len(process.joined) == 1  # the thread that has started it
 
 
+@pytest.mark.usefixtures("beside")
 def test_an_output_that_is_started_during_a_stop_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     """Else it would wait for messages, and the service for its end."""
     output = OutputProcess("pose_socket", RobotConfig(), lambda *_: Reply(True, ""))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import subprocess
 import sys
@@ -21,8 +22,9 @@ def run_command(arguments: Sequence[str], timeout_s: float) -> str:
         StereoSfmError: it failed, or took too long.
     """
     command = [sys.executable, "-m", "stereo_sfm.cli", *arguments]
+    in_background = functools.partial(_in_background, os.getpid())
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=_in_background)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=in_background)
     except subprocess.TimeoutExpired:
         raise StereoSfmError(f"stereo-sfm {arguments[0]} took longer than {timeout_s:.0f} s") from None
     if done.returncode:
@@ -32,7 +34,7 @@ def run_command(arguments: Sequence[str], timeout_s: float) -> str:
     return done.stdout
 
 
-def _in_background() -> None:
+def _in_background(parent: int) -> None:
     """In the child."""
     os.nice(NICE)
-    end_with_parent()
+    end_with_parent(parent)
