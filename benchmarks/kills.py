@@ -77,8 +77,8 @@ class Poses:
             return self.came.wait_for(lambda: self.count >= until, GIVE_UP_S)
 
 
-def logged(root: Path, *wanted: str) -> list[tuple[float, set[int]]]:
-    """Of each recording with messages of topics: the monotonic time at which the middle one was written, and frames."""
+def logged(root: Path, topic: str) -> list[tuple[float, set[int]]]:
+    """Of each recording with a topic: the monotonic time at which its middle message was written, and its frames."""
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.recording.segments import recordings, segments
 
@@ -87,7 +87,7 @@ def logged(root: Path, *wanted: str) -> list[tuple[float, set[int]]]:
         written = list[tuple[int, int]]()
         for path in (path for s in segments(folder) for path in (s.poses, s.images) if path.exists()):
             with LogReader(path) as reader:
-                written += [(record.publish_time, record.sequence) for record in reader.messages(wanted)]
+                written += [(record.publish_time, record.sequence) for record in reader.messages([topic])]
         if written:
             middle_ns = statistics.median(ns for ns, _ in written)
             out.append(((middle_ns - began_ns) / 1e9, {frame for _, frame in written}))
@@ -183,8 +183,8 @@ def main(args: list[str] | None = None) -> int:
             began = time.monotonic()
         ended_s = time.monotonic() - began
         lost = missing(poses.at_s, logged(root, topics.FRAME))
-        unseen = missing(poses.at_s, logged(root, topics.LEFT_IMAGE, topics.DROPPED))
-        dropped = sum(len(frames) for _, frames in logged(root, topics.DROPPED))
+        told = logged(root, topics.DROPPED)
+        unseen = missing(poses.at_s, logged(root, topics.LEFT_IMAGE) + told)
         saved = (Path(place) / "store" / "map.json").exists()
     if quiet:
         print(summary("quiet", quiet))
@@ -192,7 +192,7 @@ def main(args: list[str] | None = None) -> int:
     poseless, imageless = beyond(lost, quiet + kills), beyond(unseen, quiet + kills)
     print(f"load {os.getloadavg()[0]:.1f}; ended in {ended_s:.1f} s, map saved: {saved}; recordings lack "
           f"{len(lost)} of {len(poses.at_s)} poses, {poseless} of these beyond a second from a kill, and {len(unseen)} "
-          f"images, {imageless} of these; {dropped} images were dropped, and the recordings say so")  # fmt: skip
+          f"images, {imageless} of these; of {sum(len(frames) for _, frames in told)} others they say it")  # fmt: skip
     return int(good(kills) < SHARE * len(kills) or poseless + imageless > 0 or not saved)
 
 

@@ -88,7 +88,7 @@ class ProcessRun:
             viewer: show the run.
             delays: seed of random delays in every stage, for tests.
             opened: called when the source is open, before anything is written.
-            images: takes each image in place of a log, and calls `release` when it was read.
+            images: takes each image in place of a log, and calls `release` when one that is `logged` was read.
             silent_s: a stage that does not respond for so long ends the run; None: it is only reported.
             pose_first: begin with a live camera's images as soon as there are poses; the map follows.
             standby: called at the start: whose processes are used, without log and viewer only; None: none wait.
@@ -419,8 +419,11 @@ class ProcessRun:
         if self._outer.logger is not None and self._outer.logger.is_open:
             if not self._outer.logger.put(message if data is None else data):
                 self._give_up_log(f"the logger has not taken the last {BACKLOG} messages")
-        elif isinstance(message, SlotImage) and message.logged:
-            (self._images or self.release)(message)
+        elif isinstance(message, SlotImage):
+            if self._images is not None:
+                self._images(message)
+            elif message.logged:
+                self.release(message)
 
         if isinstance(message, Keyframe):
             self._answer(self._loop.add(message, data or pickled(message)))

@@ -136,7 +136,7 @@ class Recorder:
                 return False
             if self.mode == "lean" and message.image.stamp_ns < self._next_image_ns:
                 return False
-            if len(self._held) >= HELD:
+            if not message.logged or len(self._held) >= HELD:
                 self._send(Dropped(message.image.frame_id, message.image.stamp_ns, "log", "the recorder is slow"))
                 return False
             self._next_image_ns = message.image.stamp_ns + int(THUMBNAIL_S * 1e9)

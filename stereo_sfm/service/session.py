@@ -160,10 +160,10 @@ class Session:
         self._clock.image(image.frame_id, image.stamp_ns, message.captured_s)
         now = time.monotonic()
         self._facts.image(now)
-        if now >= self._next_preview_s and (rate := self._hub.preview_hz) > 0:
+        if message.logged and now >= self._next_preview_s and (rate := self._hub.preview_hz) > 0:
             self._next_preview_s = max(self._next_preview_s + 1.0 / rate, now - 1.0 / rate)
             self._publish_preview(message)
-        if not self._recorder.image(message):
+        if not self._recorder.image(message) and message.logged:
             self._run.release(message)
 
     def _publish_preview(self, message: SlotImage) -> None:
