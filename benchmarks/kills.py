@@ -190,9 +190,10 @@ def main(args: list[str] | None = None) -> int:
         print(summary("quiet", quiet))
     print(summary(f"beside {o.busy} busy loops" if o.busy else "quiet", kills))
     poseless, imageless = beyond(lost, quiet + kills), beyond(unseen, quiet + kills)
+    said = sum(len(frames) for _, frames in told)
     print(f"load {os.getloadavg()[0]:.1f}; ended in {ended_s:.1f} s, map saved: {saved}; recordings lack "
           f"{len(lost)} of {len(poses.at_s)} poses, {poseless} of these beyond a second from a kill, and {len(unseen)} "
-          f"images, {imageless} of these; of {sum(len(frames) for _, frames in told)} others they say it")  # fmt: skip
+          f"images, {imageless} of these; {said} more are said to be missing")  # fmt: skip
     return int(good(kills) < SHARE * len(kills) or poseless + imageless > 0 or not saved)
 
 
