@@ -118,10 +118,18 @@ class SegmentRecorder:
         if self._policy.mode == "lean":
             return True
         if self._no_room or not self._images.put(self._with_missed(image)):
-            self._drop(image)
+            self._dropped_s = time.monotonic()
+            self.omit(image, self._no_room or self._images.problem or "the disk is slow")
             return False
         self._missed = []
         return True
+
+    def omit(self, image: StereoImage, why: str) -> None:
+        """An image that is not recorded: the recording says why, and its samples come with the next one."""
+        self.images_dropped += 1
+        self._missed.append(replace(image, left=image.left[:0], right=None, depth=None))
+        del self._missed[:-1000]
+        self._poses.put(Dropped(image.frame_id, image.stamp_ns, "log", why))
 
     def put(self, message: object) -> None:
         """Any other message of the run."""
@@ -194,14 +202,6 @@ class SegmentRecorder:
             if stamp_ns <= until_ns:
                 with contextlib.suppress(OSError):
                     self.segment.mark(text)
-
-    def _drop(self, image: StereoImage) -> None:
-        self.images_dropped += 1
-        self._dropped_s = time.monotonic()
-        self._missed.append(replace(image, left=image.left[:0], right=None, depth=None))
-        del self._missed[:-1000]
-        why = self._no_room or self._images.problem or "the disk is slow"
-        self._poses.put(Dropped(image.frame_id, image.stamp_ns, "log", why))
 
     def _with_missed(self, image: StereoImage) -> StereoImage:
         """An image with the number of images dropped before it, and their inertial and wheel samples."""

@@ -137,7 +137,7 @@ class Recorder:
             if self.mode == "lean" and message.image.stamp_ns < self._next_image_ns:
                 return False
             if not message.logged or len(self._held) >= HELD:
-                self._send(Dropped(message.image.frame_id, message.image.stamp_ns, "log", "the recorder is slow"))
+                self._send(message.image)
                 return False
             self._next_image_ns = message.image.stamp_ns + int(THUMBNAIL_S * 1e9)
             self._number += 1

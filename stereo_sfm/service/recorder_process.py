@@ -19,6 +19,7 @@ from stereo_sfm.recording.segments import Segment
 from stereo_sfm.recording.upload import Uploader
 from stereo_sfm.service.child import Send, run_child
 from stereo_sfm.storage.remote import Remote
+from stereo_sfm.types import StereoImage
 
 STATE_S = 0.5
 CLOSE_S = 2.0
@@ -108,6 +109,8 @@ class _Body:
         elif isinstance(message, Mark):
             if self._recorder is not None:
                 self._recorder.mark(message.text)
+        elif self._recorder is not None and isinstance(message, StereoImage):  # its pixels could not be had
+            self._recorder.omit(message, "the recorder is slow")
         elif self._recorder is not None:
             self._recorder.put(message)
 

@@ -307,6 +307,21 @@ def test_a_full_disk_costs_images_and_no_pose(tmp_path: Path, monkeypatch: pytes
     assert kept[30].imu is not None and len(kept[30].imu) == 31  # those of the dropped images, too
 
 
+def test_an_image_that_is_omitted_is_said_to_be_missing_and_its_samples_come_with_the_next(tmp_path: Path) -> None:
+    recorder = start(tmp_path, quota=Quota(10 * GB), segment_s=60.0)
+    images = list(SlidingWall(10))
+    images = [replace(i, imu=ImuSamples(np.array([i.stamp_ns]), np.zeros((1, 3)), np.ones((1, 3)))) for i in images]
+    record(recorder, images[:5])
+    recorder.omit(images[5], "the recorder is slow")
+    record(recorder, images[6:])
+    recorder.close(20.0)
+    drops = [r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.DROPPED)]
+    with open_source(recorder.folder) as source:
+        kept = list(source)
+    assert [i.frame_id for i in kept] == [0, 1, 2, 3, 4, 6, 7, 8, 9] and drops == [5] and kept[5].dropped_before == 1
+    assert kept[5].imu is not None and list(kept[5].imu.stamp_ns) == [images[5].stamp_ns, images[6].stamp_ns]
+
+
 def messages(path: Path, topic: str) -> list[object]:
     with LogReader(path) as reader:
         return list(reader.messages([topic]))

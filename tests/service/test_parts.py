@@ -37,7 +37,7 @@ from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.robot_mounting import RobotMounting
 from stereo_sfm.service.session import COMPILING, Session
 from stereo_sfm.service.states import Facts, derive_state
-from stereo_sfm.types import F64, Dropped, Frame, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import F64, Frame, MapUpdate, Observations, StereoImage, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
 from tests.synthetic import pinhole_rig
 
@@ -355,7 +355,7 @@ def test_a_lean_recording_goes_on_where_the_sources_time_begins_anew() -> None:
     assert outbox.images() == 20
 
 
-def test_an_image_without_a_slot_for_the_recorder_is_said_to_be_missing() -> None:
+def test_an_image_without_a_slot_for_the_recorder_is_sent_without_its_pixels() -> None:
     recorder, outbox = Recorder(RecordingConfig(mode="full")), Images()
     recorder._process, recorder._outbox = (cast(Any, x) for x in (object(), outbox))  # pyright: ignore
     run: Any = SimpleNamespace(info=SimpleNamespace(rig=pinhole_rig()), ring=None, release=lambda _: None)
@@ -363,7 +363,7 @@ def test_an_image_without_a_slot_for_the_recorder_is_said_to_be_missing() -> Non
     image = StereoImage(7, 700, np.zeros((2, 2), np.uint8))
     taken = [recorder.image(SlotImage(0, image, False, False, 0.0, logged=logged)) for logged in (True, False)]
     assert taken == [True, False] and outbox.images() == 1
-    assert [m.frame_id for m in outbox.sent if isinstance(m, Dropped)] == [7]
+    assert [m.frame_id for m in outbox.sent if isinstance(m, StereoImage)] == [7]
 
 
 def test_a_recorder_that_dies_at_its_start_is_not_started_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
