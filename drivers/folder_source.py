@@ -15,6 +15,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.text_file import nanoseconds
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
@@ -22,8 +23,6 @@ from stereo_sfm.pixels import decode, decode_gray, eight_bits
 from stereo_sfm.types import F32, U8, U16, ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
-
-SHOWN_WARNINGS = 5  # of unreadable images, one by one; then only their count
 
 
 @dataclass(frozen=True)
@@ -112,7 +111,8 @@ class FolderSource(BaseSource):
         self._check_first()
 
     def __iter__(self) -> Iterator[StereoImage]:
-        dropped, read, unreadable, sampled = 0, 0, 0, 0
+        dropped, read, sampled = 0, 0, 0
+        unreadable = Unreadable(self.name, "frames could not be read")
         if self.assumed_hz:
             log.warning(
                 "%s: neither names nor times.txt give the stamps: %g images a second assumed (?fps=N)",
@@ -123,9 +123,7 @@ class FolderSource(BaseSource):
                 image = self._read(frame_id, frame, dropped)
             except UnreadableImage as error:
                 dropped += 1
-                unreadable += 1
-                if unreadable <= SHOWN_WARNINGS:
-                    log.warning("%s: cannot read %s, frame %d is dropped", self.name, error, frame_id)
+                unreadable.skip(f"cannot read {error}, frame {frame_id} is dropped")
                 continue
             dropped = 0
             read += 1
@@ -133,8 +131,7 @@ class FolderSource(BaseSource):
                 until = int(np.searchsorted(self._imu.stamp_ns, frame.stamp_ns, side="right"))
                 image, sampled = replace(image, imu=self._imu.part(slice(sampled, until))), until
             yield image
-        if unreadable > SHOWN_WARNINGS:
-            log.warning("%s: %d frames could not be read", self.name, unreadable)
+        unreadable.end()
         if not read:
             raise StereoSfmError(
                 f"{self.name}: none of the {len(self.frames)} images can be read: copy or export them again"

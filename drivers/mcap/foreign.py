@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import SHOWN_WARNINGS
 from stereo_sfm.drivers.image_lists import MAX_SKEW_NS
 from stereo_sfm.drivers.mcap import McapOptions
 from stereo_sfm.drivers.mcap.clock import Clock, clock_of
@@ -25,6 +24,7 @@ from stereo_sfm.drivers.mcap.topics import choose_topics
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_camera
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.images import UnknownEncoding
@@ -50,10 +50,10 @@ class ForeignSource(BaseSource):
         self.name = str(reader.path)
         self.topics = choose_topics(reader, options.left, options.right, options.depth, options.wheel)
         self._joints = [name for name in options.joints.split(",") if name]
-        self._unreadable = 0  # images of the last reading
+        self._unreadable = Unreadable(self.name, "images could not be read")
         self._read_forward()
         left = reader.messages([self.topics.left])
-        first = next((found for record in left if (found := message_of(record, self.name)) is not None), None)
+        first = next((found for record in left if (found := message_of(record, self._unreadable)) is not None), None)
         self._video = first.encoding if first and first.video else ""
         clock = self._found_clock()
         self.topics = on_the_clock(reader, self.topics, clock)
@@ -63,7 +63,7 @@ class ForeignSource(BaseSource):
         if self.topics.depth:
             self.rig = with_virtual_camera(self.rig)
         self.ground_truth = recorded.truth(clock)
-        self._pairs = ImagePairs(reader, self.topics, clock, bool(self._video))
+        self._pairs = ImagePairs(reader, self.topics, clock, bool(self._video), self._unreadable)
         counts = {t.topic: t.count for t in reader.topics}
         self.frame_count = min(counts[t] for t in self.topics.images)
         self._bits = used_bits(self.name, self._sample)
@@ -82,7 +82,7 @@ class ForeignSource(BaseSource):
 
     def _found_clock(self) -> Clock:
         def stamps(topic: str) -> Iterator[tuple[int, int]]:
-            read = ((record, message_of(record, self.name)) for record in self.reader.messages([topic]))
+            read = ((record, message_of(record, self._unreadable)) for record in self.reader.messages([topic]))
             return ((message.stamp_ns, record.log_time) for record, message in read if message is not None)
 
         clock, warning = clock_of(self.name, self.topics.images, stamps)
@@ -128,7 +128,8 @@ class ForeignSource(BaseSource):
         Raises:
             StereoSfmError: images that do not fit the calibration.
         """
-        dropped = self._unreadable = 0
+        dropped = 0
+        self._unreadable.begin()
         imu: list[ImuReading] = []
         wheel: list[WheelReading] = []
         for frame_id, (left, other) in enumerate(self._pairs.read(start_ns, until_ns, imu, wheel)):
@@ -140,8 +141,7 @@ class ForeignSource(BaseSource):
                     imu=take_imu(imu, left.stamp_ns) if self.topics.imu else None,
                     wheel=take_wheel(wheel, left.stamp_ns, self._joints) if self.topics.wheel else None,
                 )
-        if self._unreadable > SHOWN_WARNINGS:
-            log.warning("%s: %d images could not be read", self.name, self._unreadable)
+        self._unreadable.end()
 
     def _decode(
         self, frame_id: int, left: StampedImage, other: StampedImage | None, dropped: int
@@ -149,9 +149,7 @@ class ForeignSource(BaseSource):
         try:
             return self._decoded(frame_id, left, other, dropped)
         except BAD_MESSAGE as error:
-            self._unreadable += 1
-            if self._unreadable <= SHOWN_WARNINGS:
-                log.warning("%s: image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
+            self._unreadable.skip(f"image at {left.stamp_ns} ns is skipped: {error}")
             return None
 
     def _decoded(self, frame_id: int, left: StampedImage, other: StampedImage | None, dropped: int) -> StereoImage:

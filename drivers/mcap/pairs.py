@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,9 +13,8 @@ from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.samples import Reading, imu_reading, wheel_reading
 from stereo_sfm.drivers.mcap.topics import ChosenTopics
 from stereo_sfm.drivers.mcap.video import KEYFRAMES_NS, VideoDecoder
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.log.reader import Record
-
-log = logging.getLogger("stereo_sfm")
 
 STEP_BACK_NS = 200_000_000  # messages of several threads may be out of order by less
 _WAITING_BYTES = 1 << 28  # of images of one camera that wait for the other: logs may be written in bursts
@@ -33,10 +31,13 @@ class StampedImage:
 class ImagePairs:
     """Pairs of the left images with those of the other topic; an unpaired left image has None."""
 
-    def __init__(self, reader: Recording, topics: ChosenTopics, clock: Clock, video: bool) -> None:
-        """`video`: the images are parts of videos, of which each needs earlier ones."""
+    def __init__(
+        self, reader: Recording, topics: ChosenTopics, clock: Clock, video: bool, unreadable: Unreadable
+    ) -> None:
+        """`video`: the images are parts of videos, of which each needs earlier ones. `unreadable`: takes what is not an
+        image."""
         self._reader, self._topics, self._clock, self._video = reader, topics, clock, video
-        self._names = topics.images
+        self._names, self._unreadable = topics.images, unreadable
 
     def read(
         self, start_ns: int | None, until_ns: int | None, imu: list[ImuReading], wheel: list[WheelReading]
@@ -112,14 +113,14 @@ class ImagePairs:
 
     def image_of(self, record: Record) -> StampedImage | None:
         """The image of a message on the clock that counts; None for a damaged one."""
-        message = message_of(record, str(self._reader.path))
+        message = message_of(record, self._unreadable)
         return None if message is None else StampedImage(self._clock.stamp(message.stamp_ns, record.log_time), message)
 
 
-def message_of(record: Record, name: str) -> ImageMessage | None:
-    """The image of a message; None, with a warning that begins with the recording's name, for a damaged one."""
+def message_of(record: Record, unreadable: Unreadable) -> ImageMessage | None:
+    """The image of a message; None for a damaged one, which `unreadable` takes."""
     try:
         return IMAGES[schema_name(record)](record.data)
     except BAD_MESSAGE as error:
-        log.warning("%s: a message of %s cannot be read: %s", name, record.topic, error)
+        unreadable.skip(f"a message of {record.topic} cannot be read: {error}")
         return None

@@ -13,9 +13,9 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import SHOWN_WARNINGS
 from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Source, Stamps
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import images, schema, topics
 from stereo_sfm.log.attached import attached_rig, attached_truth
@@ -188,7 +188,7 @@ class McapSource(BaseSource):
         self._check_cameras()
         self.ground_truth = attached_truth(reader)  # world_T_cam0
         self.frame_count = self._complete_count()
-        self._incomplete = 0  # frames of the last reading
+        self._incomplete = Unreadable(self.name, "frames were incomplete and skipped")
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
 
     def _check_cameras(self) -> None:
@@ -237,13 +237,12 @@ class McapSource(BaseSource):
 
     def _complete_frames(self, first_ns: int | None, last_ns: int | None) -> Iterator[StereoImage]:
         pending: dict[int, _Parts] = {}
-        self._incomplete = 0
+        self._incomplete.begin()
         for record in self.reader.messages(_PARTS, first_ns, last_ns):
             self._add(pending.setdefault(record.sequence, _Parts()), record)
             yield from self._take(pending, _WAITING)
         yield from self._take(pending, 0, at_edge=first_ns is not None or bool(self.reader.truncated))
-        if self._incomplete > SHOWN_WARNINGS:
-            log.warning("%s: %d frames were incomplete and skipped", self.name, self._incomplete)
+        self._incomplete.end()
 
     def _take(self, pending: dict[int, _Parts], waiting: int, at_edge: bool = False) -> Iterator[StereoImage]:
         """The complete frames at the front; a frame still incomplete after `waiting` others is skipped."""
@@ -256,10 +255,7 @@ class McapSource(BaseSource):
             if parts.complete():
                 yield parts.image()
             elif not at_edge:
-                self._incomplete += 1
-                if self._incomplete > SHOWN_WARNINGS:
-                    continue
-                log.warning("%s: frame %d is incomplete and skipped", self.name, sequence)
+                self._incomplete.skip(f"frame {sequence} is incomplete and skipped")
 
     def _add(self, parts: _Parts, record: Record) -> None:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import struct
@@ -439,7 +440,7 @@ def test_our_own_file_without_right_images_is_an_error(tmp_path: Path, caplog: p
     whole, without, some = (tmp_path / name for name in ("whole.mcap", "without.mcap", "some.mcap"))
     write_recording(whole, MemorySource(fisheye_rig(), images))
     for path, kept in ((without, -1), (some, 30)):
-        _copy_without_right_images(whole, path, kept)
+        _copy(whole, path, _without_right_images(kept))
     with pytest.raises(StereoSfmError, match="no right images, but its calibration"):
         open_source(without)
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(some) as source:
@@ -451,13 +452,13 @@ def test_our_own_file_without_right_images_is_an_error(tmp_path: Path, caplog: p
 def test_info_counts_the_images_that_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole, some = tmp_path / "whole.mcap", tmp_path / "some.mcap"
     write_recording(whole, MemorySource(fisheye_rig(), stereo_images(40, np.random.default_rng(0))))
-    _copy_without_right_images(whole, some, 30)
+    _copy(whole, some, _without_right_images(30))
     assert main(["info", str(some)]) == 0
     assert "problem: 10 of 40 images of /cam1/image are missing" in capsys.readouterr().out
 
 
-def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
-    """The same file, as if the right camera had failed after some images."""
+def _copy(source: Path, path: Path, changed: Callable[[str, int, bytes], bytes | None]) -> None:
+    """The same file with other messages: `changed` takes topic, sequence number and data; None leaves one out."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
@@ -467,16 +468,15 @@ def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
         schemas: dict[int, int] = {}
         channels: dict[int, int] = {}
         for schema, channel, message in reader.iter_messages():
-            if channel.topic == topics.RIGHT_IMAGE and message.sequence >= kept + 1:
+            data = changed(channel.topic, message.sequence, message.data)
+            if data is None:
                 continue
             if schema is not None and schema.id not in schemas:
                 schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
             if channel.id not in channels:
                 kind = schemas[schema.id] if schema is not None else 0
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
-            writer.add_message(
-                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
-            )
+            writer.add_message(channels[channel.id], message.log_time, data, message.publish_time, message.sequence)
         for attachment in reader.iter_attachments():
             writer.add_attachment(
                 attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
@@ -484,6 +484,25 @@ def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
         for entry in reader.iter_metadata():
             writer.add_metadata(entry.name, entry.metadata)
         writer.finish()
+
+
+def _without_right_images(kept: int) -> Callable[[str, int, bytes], bytes | None]:
+    """As if the right camera had failed after some images."""
+    return lambda topic, sequence, data: None if topic == topics.RIGHT_IMAGE and sequence >= kept + 1 else data
+
+
+def test_many_damaged_messages_do_not_flood_the_terminal(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    damaged = itertools.count()
+
+    def cut(topic: str, sequence: int, data: bytes) -> bytes:
+        return data if topic != "/stereo/right/image_raw" or next(damaged) < 2 else b"\xff"
+
+    path = tmp_path / "a.mcap"
+    _copy(_write(tmp_path / "whole.mcap", count=60), path, cut)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path) as source:
+        assert len(list(source)) == 2
+    assert caplog.text.count("a message of /stereo/right/image_raw cannot be read") <= 10
+    assert "58 images could not be read" in caplog.text
 
 
 def test_a_clock_that_runs_backwards_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
