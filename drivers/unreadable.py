@@ -13,7 +13,7 @@ class Unreadable:
     """Frames, images or messages of one source that are skipped."""
 
     def __init__(self, name: str, what: str) -> None:
-        """Args: name, of the source. what: how all together are told, as "images could not be read"."""
+        """Args: name, of the source. what: how all together are called, as "images could not be read"."""
         self._name, self._what = name, what
         self._count = 0
 
