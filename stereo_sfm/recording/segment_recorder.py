@@ -126,6 +126,7 @@ class SegmentRecorder:
 
     def omit(self, image: StereoImage, why: str) -> None:
         """An image that is not recorded: the recording says why, and its samples come with the next one."""
+        self._next_segment_if_due(image.stamp_ns)
         self.images_dropped += 1
         self._missed.append(replace(image, left=image.left[:0], right=None, depth=None))
         del self._missed[:-1000]

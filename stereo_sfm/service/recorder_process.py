@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 
@@ -14,7 +15,7 @@ from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.watchdog import Heartbeat, HeartbeatThread
 from stereo_sfm.recording.segment_recorder import Policy, RecorderState, SegmentRecorder
-from stereo_sfm.recording.segment_writers import AGAIN_S
+from stereo_sfm.recording.segment_writers import AGAIN_S, MESSAGES_WAITING
 from stereo_sfm.recording.segments import Segment
 from stereo_sfm.recording.upload import Uploader
 from stereo_sfm.service.child import Send, run_child
@@ -88,6 +89,7 @@ class _Body:
         self._next_state_s = self._next_open_s = 0.0
         self._problem, self._full = "", False
         self._begin: Begin | None = None
+        self._waiting: deque[object] = deque(maxlen=MESSAGES_WAITING)  # of a session whose folder cannot be made yet
         self._uploader: Uploader | None = None  # goes on between sessions
 
     def take(self, message: object) -> None:
@@ -109,10 +111,10 @@ class _Body:
         elif isinstance(message, Mark):
             if self._recorder is not None:
                 self._recorder.mark(message.text)
-        elif self._recorder is not None and isinstance(message, StereoImage):  # its pixels could not be had
-            self._recorder.omit(message, "the recorder is slow")
         elif self._recorder is not None:
-            self._recorder.put(message)
+            _put(self._recorder, message, "the recorder is slow")
+        elif self._begin is not None:
+            self._waiting.append(message)
 
     def _open(self, begin: Begin) -> None:
         self._next_open_s = time.monotonic() + AGAIN_S
@@ -124,9 +126,13 @@ class _Body:
                 return  # the pipeline has died: the next one begins another recording
         try:
             self._recorder = SegmentRecorder(begin.policy, begin.rig, begin.config, begin.source, begin.opening)
-            self._problem, self._full = "", False
         except OSError as error:
             self._problem, self._full = f"cannot record to {begin.policy.root}: {error.strerror}", disk_is_full(error)
+            return
+        for message in self._waiting:
+            _put(self._recorder, message, self._problem)
+        self._waiting.clear()
+        self._problem, self._full = "", False
 
     def _send_to(self, policy: Policy) -> None:
         """Send recordings to the bucket of this policy."""
@@ -151,6 +157,8 @@ class _Body:
                 self._open_again(self._begin)
             if self._recorder is not None:
                 image = self._ring.read(message)
+            else:
+                self._waiting.append(message.image)
         self._send(Read(number))
         if image is not None and self._recorder is not None:
             self._recorder.image(image)
@@ -170,10 +178,21 @@ class _Body:
             self._send(state if recorder is None else recorder.state())
 
     def finish(self) -> None:
-        """Close the recording."""
+        """Close the recording; a folder for what waits is tried once more."""
+        if self._waiting and self._begin is not None:
+            self._open(self._begin)
         recorder, self._recorder, self._begin = self._recorder, None, None
+        self._waiting.clear()
         if recorder is not None:
             recorder.close(CLOSE_S)
         if self._ring is not None:
             self._ring.close()
             self._ring = None
+
+
+def _put(recorder: SegmentRecorder, message: object, why: str) -> None:
+    """A message of the run; an image comes without its pixels, which could not be had."""
+    if isinstance(message, StereoImage):
+        recorder.omit(message, why)
+    else:
+        recorder.put(message)

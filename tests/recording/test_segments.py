@@ -19,7 +19,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import topics
-from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.recording import segment_recorder as module
 from stereo_sfm.recording import segment_writers
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
@@ -322,7 +322,7 @@ def test_an_image_that_is_omitted_is_said_to_be_missing_and_its_samples_come_wit
     assert kept[5].imu is not None and list(kept[5].imu.stamp_ns) == [images[5].stamp_ns, images[6].stamp_ns]
 
 
-def messages(path: Path, topic: str) -> list[object]:
+def messages(path: Path, topic: str) -> list[Record]:
     with LogReader(path) as reader:
         return list(reader.messages([topic]))
 

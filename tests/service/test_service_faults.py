@@ -71,6 +71,7 @@ def running(settings: RobotConfig) -> Generator[Running]:
 @pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: Path) -> None:
     with running(config(tmp_path)) as watched:
+        wait_for(lambda: any(file.stat().st_size > 1e5 for file in tmp_path.rglob("*.images.mcap")))  # it starts last
         pid = watched.service.pids["recorder"]
         os.kill(pid, fault)
         wait_for(lambda: watched.service.pids.get("recorder") not in (None, pid))
