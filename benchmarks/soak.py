@@ -143,7 +143,7 @@ class Watch:
     poses: int = 0
     untracked: int = 0
     losses: list[list[int]] = field(default_factory=list[list[int]])  # first and last frame without a pose
-    arrived: array[float] = field(default_factory=lambda: array("d"))  # when captured, when posed: by the clock
+    arrived: array[float] = field(default_factory=lambda: array("d"))  # frame, when captured, when posed: by the clock
     missing: dict[int, int] = field(default_factory=dict[int, int])  # first missing frame -> how many
     states: list[tuple[int, str, str]] = field(default_factory=list[tuple[int, str, str]])
     sessions: list[int] = field(default_factory=list[int])  # frames at which they began
@@ -169,7 +169,7 @@ class Watch:
         self.poses += 1
         self.untracked += not pose.tracked
         if pose.frame_id < self.by_clock:
-            self.arrived.extend((pose.captured_s, time.monotonic()))
+            self.arrived.extend((pose.frame_id, pose.captured_s, time.monotonic()))
             if self.turns is not None:
                 self.turns.pose(pose.captured_s)
         elif self.turns is not None:
@@ -459,11 +459,12 @@ def judge_recordings(watch: Watch, root: Path) -> list[str]:
 
 def judge_clock(watch: Watch) -> list[str]:
     """Print rate and latency of the part by the clock; whether it kept up."""
-    if len(watch.arrived) < 4:
+    if len(watch.arrived) < 6:
         return []
-    captured, posed = np.array(watch.arrived).reshape(-1, 2).T
+    frames, captured, posed = np.array(watch.arrived).reshape(-1, 3).T
     steps, delay = np.diff(captured), (posed - captured) * 1e3
-    rate = 1 / steps[steps < PAUSE_S].mean()
+    fault = (np.diff(frames) > 1) | np.isin(frames[1:], watch.sessions) | (steps > PAUSE_S)
+    rate = 1 / steps[~fault].mean()
     print(f"  by the clock: {len(captured)} poses at {rate:.2f} Hz, image to pose at a callback "
           f"{np.median(delay):.0f} ms, 95 % {np.percentile(delay, 95):.0f} ms")  # fmt: skip
     return [f"{rate:.2f} poses a second instead of {RATE:g}"] if rate < 0.99 * RATE else []
