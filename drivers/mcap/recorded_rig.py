@@ -20,6 +20,7 @@ from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, other_reading, stereo_rig
 from stereo_sfm.drivers.mcap.samples import imu_reading, wheel_reading
 from stereo_sfm.drivers.mcap.topics import ChosenTopics, camera_topic, is_rectified
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import Trajectory
 
@@ -103,6 +104,7 @@ class RecordedRig:
     def _transforms(self) -> list[Transform]:
         """The fixed ones."""
         out: list[Transform] = []
+        unreadable = Unreadable(self._name, "transforms could not be read")
         start, _ = self._reader.time_range
         fixed = [t for t in self._topics.transforms if "static" in words_of(t)]  # few: the clock may be set after them
         others = [t for t in self._topics.transforms if t not in fixed]
@@ -111,7 +113,8 @@ class RecordedRig:
             try:
                 out += TRANSFORMS[schema_name(record)](record.data)
             except BAD_MESSAGE as error:
-                log.warning("%s: a transform on %s cannot be read: %s", self._name, record.topic, error)
+                unreadable.skip(f"a transform on {record.topic} cannot be read: {error}")
+        unreadable.end()
         return out
 
     def truth(self, clock: Clock) -> Trajectory | None:

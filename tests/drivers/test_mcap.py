@@ -7,6 +7,7 @@ import logging
 import os
 import struct
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -503,6 +504,20 @@ def test_many_damaged_messages_do_not_flood_the_terminal(tmp_path: Path, caplog:
         assert len(list(source)) == 2
     assert caplog.text.count("a message of /stereo/right/image_raw cannot be read") <= 10
     assert "58 images could not be read" in caplog.text
+
+
+def test_many_damaged_transforms_do_not_flood_the_terminal(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def transforms(writer: ProtobufWriter) -> None:
+        rows = [("left_optical", "right_optical", foxglove.pose(LEFT_T_RIGHT))]
+        for k in range(60):
+            writer.write_message("/tf", foxglove.transforms(10**9 + k, rows), 10**9 + k, 10**9 + k)
+
+    path, whole = tmp_path / "a.mcap", _write(tmp_path / "whole.mcap", extra=transforms)
+    _copy(whole, path, lambda topic, sequence, data: b"\xff" if topic == "/tf" else data)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), suppress(StereoSfmError), open_source(path):
+        pass
+    readings = caplog.text.count("61 transforms could not be read")
+    assert readings and caplog.text.count("a transform on /tf cannot be read") == 5 * readings
 
 
 def test_a_clock_that_runs_backwards_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
