@@ -1,4 +1,4 @@
-"""Attacks and busy loops beside a soak, in turn: whether poses are later with attacks than without."""
+"""Attacks or busy loops beside a soak, in turn: whether poses are later with attacks than without."""
 
 from __future__ import annotations
 
@@ -27,31 +27,35 @@ from benchmarks.attack import (
     without_a_token,
 )
 
-TURN_S = 60.0
-SURE_S = 5.0  # of each turn, and of each session, that do not count: processes start
+TURN_S = 40.0  # the longest attack takes 30 s
+SURE_S = 10.0  # of each turn, of each session and after a loss, that do not count: what waited is caught up with
 LATE_S = 0.1  # from image to pose: three images
 BUSY = 8
 DONE = "attacks.txt"
 REQUESTS = 200  # hostile ones before the next kind of attack
-SIGMAS = 3.0  # by which the share of late poses may differ by chance
-TURNS = tuple((busy, attacked) for busy in (False, True) for attacked in (False, True))
-ATTACKS = (
+CHANCE = 1.35e-3  # of a difference between turns that nothing causes: three sigmas, on one side
+ALONE, ATTACKS, LOOPS = "alone", "attacks", f"{BUSY} busy loops"
+TURNS = (ALONE, ATTACKS, LOOPS, ATTACKS, ALONE, LOOPS)  # what comes after the loops finds the images that these delayed
+KINDS = (
     hostile_requests, guesses, idle_connections, silent_connections, without_a_token, clients_that_never_read,
     foreign_page,
 )  # fmt: skip
 
 
-def attack(target: Target, busy: bool) -> None:
+def attack(target: Target, first: int) -> None:
     """Body of the process that attacks: it gets what others leave of the processor, as if it were another computer.
 
     What it has done is a line each in `DONE`.
+
+    Args:
+        first: the kind of attack that it begins with.
     """
     os.nice(19)
     with (target.folder / DONE).open("a", buffering=1) as done:
-        for one in itertools.cycle(ATTACKS):
+        for one in itertools.islice(itertools.cycle(KINDS), first, None):
             with suppress(Exception):
                 closed = one(target)[1]
-                done.write(f"{one.__name__} {busy:d} {closed:d}\n")
+                done.write(f"{one.__name__} {closed:d}\n")
 
 
 class Turns:
@@ -60,8 +64,7 @@ class Turns:
     def __init__(self, folder: Path, page: int, foxglove: int, poses: int) -> None:
         self._target = Target(folder, page, foxglove, poses, REQUESTS, None)  # type: ignore[arg-type]
         (folder / DONE).unlink(missing_ok=True)
-        self.delays: dict[tuple[bool, bool], list[float]] = {turn: [] for turn in TURNS}
-        self._turn: tuple[bool, bool] | None = None
+        self.delays: list[tuple[str, list[float]]] = []  # of each turn, in s
         self._counts_from_s = math.inf
         self._over, self._rest = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -77,32 +80,40 @@ class Turns:
             self._thread.join()
 
     def rest(self) -> None:
-        """What remains has attacks every other minute and no busy loops: it is to come to an end."""
+        """What remains has attacks and no busy loops: it is to come to an end."""
         self._rest.set()
 
-    def session(self) -> None:
-        """A session begins."""
+    def unsettle(self) -> None:
+        """A session begins, or the camera is lost."""
         self._counts_from_s = max(self._counts_from_s, time.monotonic() + SURE_S)
 
-    def pose(self, captured_s: float) -> None:
-        """A pose has arrived."""
-        now, turn = time.monotonic(), self._turn
-        if turn is not None and now >= self._counts_from_s:
-            self.delays[turn].append(now - captured_s)
+    def pose(self, captured_s: float, tracked: bool) -> bool:
+        """A pose has arrived; whether it is one of those that must come at the camera's rate."""
+        if not tracked:
+            self.unsettle()
+        now = time.monotonic()
+        if now < self._counts_from_s:
+            return False
+        turn, delays = self.delays[-1]
+        delays.append(now - captured_s)
+        return turn != LOOPS
 
     def _work(self) -> None:
         spawn = multiprocessing.get_context("spawn")
-        for busy, attacked in itertools.cycle(TURNS):
-            if busy and self._rest.is_set():
+        for k, turn in enumerate(itertools.cycle(TURNS)):
+            if turn == LOOPS and self._rest.is_set():
                 continue
-            loops = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY * busy)]
-            attacker = spawn.Process(target=attack, args=(self._target, busy), daemon=True) if attacked else None
-            if attacker is not None:
+            loops = [
+                subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(BUSY * (turn == LOOPS))
+            ]
+            attacker = spawn.Process(target=attack, args=(self._target, k), daemon=True)
+            if turn == ATTACKS:
                 attacker.start()
-            self._turn, self._counts_from_s = (busy, attacked), time.monotonic() + SURE_S
+            self.delays.append((turn, []))
+            self._counts_from_s = time.monotonic() + SURE_S
             over = self._over.wait(TURN_S)
-            self._turn = None
-            for process in (*loops, *([attacker] if attacker is not None else [])):
+            self._counts_from_s = math.inf
+            for process in (*loops, *([attacker] if turn == ATTACKS else [])):
                 process.kill()
             if over:
                 return
@@ -111,33 +122,32 @@ class Turns:
         """Print what was done to the service; that it was not attacked."""
         file = self._target.folder / DONE
         done = [line.split() for line in file.read_text().splitlines()] if file.exists() else []
-        for busy in (False, True):
-            kinds = Counter(name for name, beside, _ in done if beside == f"{busy:d}")
-            said = ", ".join(f"{count} {name}" for name, count in sorted(kinds.items()))
-            print(f"  {BUSY * busy} busy loops, attacks: {said or 'none'}")
-        still_open = sum(closed == "0" for *_, closed in done)
-        print(f"  {len(done)} attacks, {still_open} with another outcome than on a quiet computer")
-        return [] if done or not self.delays[False, True] else ["no attack was carried out"]
+        kinds = Counter(name for name, _ in done)
+        print(f"  attacks: {', '.join(f'{count} {name}' for name, count in sorted(kinds.items())) or 'none'}")
+        print(f"  {sum(closed == '0' for _, closed in done)} with another outcome than on a quiet computer")
+        missed = not done and any(turn == ATTACKS and delays for turn, delays in self.delays)
+        return ["no attack was carried out"] if missed else []
 
     def judge(self) -> list[str]:
-        """Print what was measured; where more poses were late with attacks."""
-        wrong = self._judge_attacks()
-        for (busy, attacked), delays in self.delays.items():
-            ms = 1e3 * np.array(delays or [math.nan])
-            late = sum(d > LATE_S for d in delays)
-            print(f"  {BUSY * busy} busy loops, {'attacks' if attacked else 'none   '}: {len(delays)} poses, median "
-                  f"{np.median(ms):.0f} ms, 95 % {np.percentile(ms, 95):.0f} ms, 99 % {np.percentile(ms, 99):.0f} ms, "
-                  f"late {late} ({100 * late / max(len(delays), 1):.2f} %)")  # fmt: skip
-        for busy in (False, True):
-            (n, k), (m, j) = (
-                (len(d), sum(x > LATE_S for x in d)) for d in (self.delays[busy, False], self.delays[busy, True])
-            )
-            if not n or not m:
+        """Print what was measured; that more poses were late with attacks, by the spread of the turns."""
+        wrong, shares = self._judge_attacks(), dict[str, list[float]]()
+        for kind in (ALONE, ATTACKS, LOOPS):
+            turns = [np.array(delays) for turn, delays in self.delays if turn == kind and delays]
+            if not turns:
                 continue
-            share = (k + j) / (n + m)
-            sigma = math.sqrt(max(share * (1 - share), 1 / (n + m)) * (1 / n + 1 / m))
-            if j / m - k / n > SIGMAS * sigma:
-                wrong.append(
-                    f"{BUSY * busy} busy loops: {100 * j / m:.2f} % late with attacks, {100 * k / n:.2f} without"
-                )
+            ms = 1e3 * np.concatenate(turns)
+            shares[kind] = [float(np.mean(delays > LATE_S)) for delays in turns]
+            of_each = ", ".join(f"{100 * share:.1f}" for share in shares[kind])
+            print(f"  {kind}: {len(ms)} poses in {len(turns)} turns, median {np.median(ms):.0f} ms, "
+                  f"95 % {np.percentile(ms, 95):.0f} ms, 99 % {np.percentile(ms, 99):.0f} ms, "
+                  f"late {100 * np.mean(ms > 1e3 * LATE_S):.2f} % ({of_each})")  # fmt: skip
+        alone, attacked = shares.get(ALONE, []), shares.get(ATTACKS, [])
+        if min(len(alone), len(attacked)) > 1:
+            from scipy import stats  # which takes a second, in each process of the service
+
+            tested = stats.ttest_ind(attacked, alone, alternative="greater")
+            chance = float(np.nan_to_num(np.asarray(tested)[1], nan=1.0))  # of turns that are all the same
+            print(f"  chance of as many late poses with attacks: {chance:.3g}")
+            if chance < CHANCE:
+                wrong.append(f"{100 * np.mean(attacked):.2f} % late with attacks, {100 * np.mean(alone):.2f} without")
         return wrong

@@ -10,9 +10,8 @@ but ROS 2, and a client reads the pose socket. Printed: the resident memory of e
 camera time (without the first half hour after its start), every fault and how long it took, missing poses, dropped
 images, delays in the part by the clock, recordings against their quota. The exit code is 1 if anything is wrong.
 
-With `--attacks`, minutes without and with attacks, and both beside eight busy loops, alternate in the part by the
-clock; printed is how many poses of each were late. Not more may be with attacks than without. Minutes with and without
-attacks go on after it.
+With `--attacks`, turns alone, with attacks and beside eight busy loops alternate in the part by the clock; printed is
+how many poses of each were late. Not more may be with attacks than alone. Turns alone and with attacks go on after it.
 """
 
 from __future__ import annotations
@@ -103,7 +102,7 @@ class StoreCamera(BaseSource):
                 due = time.monotonic()
             if k < self._by_clock:
                 time.sleep(max(0.0, due - time.monotonic()))
-                due += 1.0 / RATE
+                due = max(due + 1.0 / RATE, time.monotonic())  # a camera does not make up for what it has not taken
             at = k % (2 * n - 2)
             at = at if at < n else 2 * n - 2 - at
             left, right = np.array(self._left[at]), np.array(self._right[at])
@@ -143,7 +142,8 @@ class Watch:
     poses: int = 0
     untracked: int = 0
     losses: list[list[int]] = field(default_factory=list[list[int]])  # first and last frame without a pose
-    arrived: array[float] = field(default_factory=lambda: array("d"))  # frame, when captured, when posed: by the clock
+    # frame, when captured, when posed: of the part by the clock, of what counts in its turns if there are any
+    arrived: array[float] = field(default_factory=lambda: array("d"))
     missing: dict[int, int] = field(default_factory=dict[int, int])  # first missing frame -> how many
     states: list[tuple[int, str, str]] = field(default_factory=list[tuple[int, str, str]])
     sessions: list[int] = field(default_factory=list[int])  # frames at which they began
@@ -168,19 +168,18 @@ class Watch:
         self.frame, self.tracked = pose.frame_id, pose.tracked
         self.poses += 1
         self.untracked += not pose.tracked
-        if pose.frame_id < self.by_clock:
-            self.arrived.extend((pose.frame_id, pose.captured_s, time.monotonic()))
+        if pose.frame_id >= self.by_clock:
             if self.turns is not None:
-                self.turns.pose(pose.captured_s)
-        elif self.turns is not None:
-            self.turns.rest()
+                self.turns.rest()
+        elif self.turns is None or self.turns.pose(pose.captured_s, pose.tracked):
+            self.arrived.extend((pose.frame_id, pose.captured_s, time.monotonic()))
 
     def start(self, started: Started) -> None:
         if started.session > self.session:  # else it tells how the camera is mounted
             self.session = started.session
             self.sessions.append(self.frame + 1)
             if self.turns is not None:
-                self.turns.session()
+                self.turns.unsettle()
 
     def restarted(self, first: float, count: float) -> bool:
         """Whether a session began about where so many frames are missing."""
