@@ -16,7 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import inlined, njit, project_one
 from stereo_sfm.tracking.flow.klt import COARSE, Pyramid
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, I32, Bool
 
 ITERATIONS = 12  # on each level, at most: an alignment that has not ended by then does not converge
 SEARCHED = 0.25  # of the field of view: rotations to either side that are tried where no prediction holds
@@ -80,43 +80,6 @@ def _normal_equations(prev, cur, bearings, stride, model, params, scale, rotatio
     return normal, rhs, total / max(count, 1), count
 
 
-@njit
-def _similarities(prev, cur, bearings, stride, model, params, scale, rotations):
-    """(M,) correlation of two images' brightness where both are seen, at rotations (M, 3, 3); -1 if that is too little.
-
-    `bearings`: (h, w, 3) of the pixels of a level of the previous image; every `stride`-th is used.
-    """
-    h, w = bearings.shape[:2]
-    hc, wc = cur.shape
-    out = np.full(len(rotations), -1.0)
-    for m in range(len(rotations)):
-        r = rotations[m]
-        total, n, sa, sb, saa, sbb, sab = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for v in range(0, h, stride):
-            for u in range(0, w, stride):
-                b = bearings[v, u]
-                if math.isnan(b[0]):
-                    continue
-                total += 1
-                p = _turned(r, b, model, params)[3]
-                if math.isnan(p[0]):
-                    continue
-                cu, cv = int(round(p[0] / scale)), int(round(p[1] / scale))
-                if cu < 0 or cv < 0 or cu >= wc or cv >= hc:
-                    continue
-                before, now = float(prev[v, u]), float(cur[cv, cu])
-                n += 1
-                sa += before
-                sb += now
-                saa += before * before
-                sbb += now * now
-                sab += before * now
-        if n > SEARCHED * total:
-            spread = (saa - sa * sa / n) * (sbb - sb * sb / n)
-            out[m] = (sab - sa * sb / n) / math.sqrt(spread) if spread > 0 else -1.0
-    return out
-
-
 class CoarseRotation:
     """Rotation of the camera between two pyramids."""
 
@@ -129,15 +92,36 @@ class CoarseRotation:
         self._top = levels - 1
         self._stride = max(round(math.sqrt(u.size * v.size / COMPARED)), 1)
         self._step_rad = SPACING_PX * spacing / camera.fx
+        self._tried: tuple[F64, Bool, I32] | None = None  # made when it is needed for the first time
 
     def search(self, prev: Pyramid, cur: Pyramid) -> F64:
-        """The rotation (3, 3) that takes bearings of `prev` into `cur`, whatever the prediction: the best of a grid."""
-        rotations = self._grid()
-        found = _similarities(
-            prev[self._top], cur[self._top], self._bearings, self._stride, self._camera.model_id, self._camera.params,
-            float(2**self._top), rotations,
-        )  # fmt: skip
-        return self.align(prev, cur, rotations[int(np.argmax(found))])
+        """The rotation (3, 3) that takes bearings of `prev` into `cur`, whatever the prediction: the best of a grid.
+
+        That is where the brightness of both images correlates most, of rotations at which enough of it is in both.
+        """
+        rotations, compared, places = self._tried = self._tried or self._places()
+        seen, a = places >= 0, prev[self._top][:: self._stride, :: self._stride][compared].astype(np.float64)
+        a, b = np.where(seen, a, 0.0), np.where(seen, cur[self._top].ravel()[places], 0.0)
+        n, sum_a, sum_b = seen.sum(1), a.sum(1), b.sum(1)
+        with np.errstate(all="ignore"):
+            spread = ((a * a).sum(1) - sum_a * sum_a / n) * ((b * b).sum(1) - sum_b * sum_b / n)
+            alike = ((a * b).sum(1) - sum_a * sum_b / n) / np.sqrt(spread)
+        alike[~(n > SEARCHED * seen.shape[1]) | ~(spread > 0)] = -1.0
+        return self.align(prev, cur, rotations[int(np.argmax(alike))])
+
+    def _places(self) -> tuple[F64, Bool, I32]:
+        """Rotations (M, 3, 3), which of every `_stride`-th pixel are compared, and (M, K) where these would be.
+
+        Places are pixels of the top level, counted row by row; -1 outside of the image.
+        """
+        rotations, bearings = self._grid(), self._bearings[:: self._stride, :: self._stride]
+        compared, (height, width) = np.isfinite(bearings[..., 0]), self._bearings.shape[:2]
+        places = np.full((len(rotations), int(compared.sum())), -1, np.int32)
+        for rotation, row in zip(rotations, places, strict=True):
+            u, v = np.rint(self._camera.project(bearings[compared] @ rotation.T) / 2**self._top).T
+            inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+            row[inside] = v[inside] * width + u[inside]
+        return rotations, compared, places
 
     def _grid(self) -> F64:
         """(M, 3, 3) rotations about the image's axes, by which the camera may have turned."""
