@@ -43,6 +43,7 @@ from stereo_sfm.drivers.mcap.topics import camera_topic, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.ros2.this_computer import keep_here
 from stereo_sfm.drivers.source import BaseSource
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.images import UnknownEncoding
 from stereo_sfm.pixels import eight_bits
@@ -112,6 +113,7 @@ class Ros2Source(BaseSource):
         self.counters = self._counters = Counters()
         self._topics = [t for t in (options.left, options.right) if t]
         self.name = f"ros2:{','.join(self._topics)}"
+        self._unreadable = Unreadable(self.name, "images could not be read")
         self._pairs = _Pairs(bool(options.right), int(options.skew_ms * 1e6), self._counters)
         self._infos: dict[str, CameraInfo] = {}
         self._calibrations: tuple[str, str] | None = None  # topics of both cameras', where these are used
@@ -154,6 +156,7 @@ class Ros2Source(BaseSource):
             node.destroy_node()
             rclpy.try_shutdown(context=self._context)
             self._pairs.ready.fail(DeviceLost(f"{self.name} is closed"))
+            self._unreadable.end()
 
     def _subscribe_all(self) -> None:
         from rclpy.qos import qos_profile_sensor_data
@@ -337,7 +340,7 @@ class Ros2Source(BaseSource):
         except UnknownEncoding as error:
             raise StereoSfmError(f"{self.name}: {error}") from None
         except BAD_MESSAGE as error:
-            log.warning("%s: the image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
+            self._unreadable.skip(f"the image at {left.stamp_ns} ns is skipped: {error}")
             return None
         for image, camera in zip(pixels, (self.rig.left, self.rig.right), strict=False):
             if camera is not None and image.shape != (camera.height, camera.width):

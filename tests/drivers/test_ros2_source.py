@@ -17,6 +17,9 @@ import pytest
 
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.live.errors import DeviceLost
+from stereo_sfm.drivers.mcap.messages import ImageMessage
+from stereo_sfm.drivers.ros2.source import Ros2Source
+from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.system import Tracker
 from stereo_sfm.types import StereoImage
@@ -34,6 +37,16 @@ def test_without_rclpy_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> No
         open_source("ros2:?left=/l&right=/r")
     with pytest.raises(StereoSfmError, match="cannot be a node's name"):
         open_source("ros2:/camera?left=/l")
+
+
+def test_of_many_damaged_images_few_are_said_one_by_one(caplog: pytest.LogCaptureFixture) -> None:
+    source: Any = object.__new__(Ros2Source)
+    source.name, source._unreadable = "ros2:/l,/r", Unreadable("ros2:/l,/r", "images could not be read")
+    damaged = ImageMessage(1, "left", False, b"few", 64, 48, 64, "mono8")
+    assert all(source._image(0, damaged, damaged, 0) is None for _ in range(20))
+    assert len(caplog.records) == 5 and "the image at 1 ns is skipped" in caplog.messages[0]
+    source._unreadable.end()
+    assert "20 images could not be read" in caplog.messages[-1]
 
 
 class Camera:
