@@ -7,9 +7,10 @@ The images are the bundled recording's here; yours come from a camera or a disk,
 
 import sys
 
-import numpy as np
+import stereo_sfm as s  # before numpy: it chooses the machine code, so that the bits are those of a run
 
-import stereo_sfm as s
+# isort: split
+import numpy as np
 
 
 def main(frames: int = 40) -> None:

@@ -112,7 +112,8 @@ class _Callbacks:
 class System:
     """Tracking, mapping and loop closing in this process, one image at a time: the same bits as `stereo-sfm run`.
 
-    Use it in a `with` statement, or call `finish` after the last image, so that pending work reaches the map.
+    That holds in a program that imports `stereo_sfm` before numpy, OpenCV and scipy (same_code.py). Use it in a `with`
+    statement, or call `finish` after the last image, so that pending work reaches the map.
     """
 
     def __init__(
