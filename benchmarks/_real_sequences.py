@@ -103,6 +103,9 @@ _AS_THEY_ARE = (
     Sequence("kitti_05_part", "kitti_05_part/sequences/05", starts_s=(0.0, 0.1, 0.2, 0.3, 0.4)),
     Sequence("daimler_bridge", "daimler_bridge", starts_s=(0.0, 1.0, 2.0, 3.0, 5.0)),
     Sequence("fr1_desk", "rgbd_dataset_freiburg1_desk", starts_s=(0.0, 2.0, 4.0, 6.0, 8.0), kind="depth"),
+    # Of iamliguangming/MEAM620 (MachineHall01_reduced) and MIT-SPARK/Kimera-VIO (MicroEurocDataset), laid out as EuRoC.
+    Sequence("euroc_mh01_30s", "euroc_mh01_30s", rate_hz=20.0, starts_s=(0.0, 1.0, 2.0, 3.0, 5.0), long=True),
+    Sequence("euroc_v101_start", "euroc_v101_start", rate_hz=20.0, kind="inertial", rest=True),
     Sequence("karlsruhe_part", "karlsruhe_part", rate_hz=9.5, shared=True),
     Sequence("kitti_00_part", "kitti", rate_hz=9.65, shared=True, best_cpp="0.319 m", long=True),
     Sequence("euroc_mh01_part", "euroc_mh01", rate_hz=20.0, shared=True, kind="inertial", best_cpp="4.6 mm", long=True),
