@@ -39,7 +39,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks._soak_attacks import Turns
+from benchmarks._soak_attacks import SURE_S, Turns
 from stereo_sfm.calib.formats.native import read_native, write_native
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.drivers.source import BaseSource, open_source
@@ -142,8 +142,8 @@ class Watch:
     poses: int = 0
     untracked: int = 0
     losses: list[list[int]] = field(default_factory=list[list[int]])  # first and last frame without a pose
-    # frame, when captured, when posed: of the part by the clock, of what counts in its turns if there are any
-    arrived: array[float] = field(default_factory=lambda: array("d"))
+    counts_from_s: float = 0.0  # a while after the last start and the last loss
+    arrived: array[float] = field(default_factory=lambda: array("d"))  # when captured, when posed: by the clock
     missing: dict[int, int] = field(default_factory=dict[int, int])  # first missing frame -> how many
     states: list[tuple[int, str, str]] = field(default_factory=list[tuple[int, str, str]])
     sessions: list[int] = field(default_factory=list[int])  # frames at which they began
@@ -168,22 +168,20 @@ class Watch:
         self.frame, self.tracked = pose.frame_id, pose.tracked
         self.poses += 1
         self.untracked += not pose.tracked
+        now = time.monotonic()
+        if not pose.tracked:
+            self.counts_from_s = now + SURE_S
         if pose.frame_id >= self.by_clock:
             if self.turns is not None:
                 self.turns.rest()
-        elif self.turns is None or self.turns.pose(pose.captured_s, pose.tracked):
-            self.arrived.extend((pose.frame_id, pose.captured_s, time.monotonic()))
+        elif now >= self.counts_from_s and (self.turns is None or self.turns.pose(pose.captured_s, now)):
+            self.arrived.extend((pose.captured_s, now))
 
     def start(self, started: Started) -> None:
         if started.session > self.session:  # else it tells how the camera is mounted
             self.session = started.session
             self.sessions.append(self.frame + 1)
-            if self.turns is not None:
-                self.turns.unsettle()
-
-    def restarted(self, first: float, count: float) -> bool:
-        """Whether a session began about where so many frames are missing."""
-        return any(first <= s <= first + count + 1 for s in self.sessions)
+            self.counts_from_s = time.monotonic() + SURE_S
 
     def status(self, status: Status) -> None:
         if not self.states or self.states[-1][1] != status.state:
@@ -411,7 +409,7 @@ def judge_memory(watch: Watch) -> list[str]:
 
 def judge_poses(watch: Watch, dark: tuple[int, ...], read: tuple[int, int, list[tuple[int, int]]] | None) -> list[str]:
     """Print what is missing in callbacks and at the pose socket, and losses; what nothing explains."""
-    unexplained = {k: n for k, n in watch.missing.items() if not watch.restarted(k, n)}
+    unexplained = {k: n for k, n in watch.missing.items() if not any(k <= s <= k + n + 1 for s in watch.sessions)}
     print(f"  frames missing between poses: {sum(watch.missing.values())}, unexplained: {unexplained or 'none'}")
     wrong = [f"{n} frames missing from {k}" for k, n in unexplained.items()]
     if read is None:
@@ -462,13 +460,13 @@ def judge_recordings(watch: Watch, root: Path) -> list[str]:
 
 def judge_clock(watch: Watch) -> list[str]:
     """Print rate and latency of the part by the clock; whether it kept up."""
-    if len(watch.arrived) < 6:
+    if not watch.by_clock:
         return []
-    frames, captured, posed = np.array(watch.arrived).reshape(-1, 3).T
+    if len(watch.arrived) < 4:
+        return ["no poses to measure a rate from"]
+    captured, posed = np.array(watch.arrived).reshape(-1, 2).T
     steps, delay = np.diff(captured), (posed - captured) * 1e3
-    missing = zip(frames[:-1] + 1, np.diff(frames) - 1, strict=True)
-    fault = (steps >= PAUSE_S) | np.array([watch.restarted(*gap) for gap in missing])
-    rate = 1 / steps[~fault].mean()
+    rate = 1 / steps[steps < PAUSE_S].mean()
     print(f"  by the clock: {len(captured)} poses at {rate:.2f} Hz, image to pose at a callback "
           f"{np.median(delay):.0f} ms, 95 % {np.percentile(delay, 95):.0f} ms")  # fmt: skip
     return [f"{rate:.2f} poses a second instead of {RATE:g}"] if not rate >= 0.99 * RATE else []

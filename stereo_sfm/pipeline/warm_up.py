@@ -112,7 +112,7 @@ def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
     if config.odometry.method != "flow":
         return
     pyramid = build_pyramid(image, config.tracker.pyramid_levels)
-    CoarseRotation(rig.left, config.tracker.pyramid_levels).search(pyramid, pyramid)
+    CoarseRotation(rig.left, config.tracker.pyramid_levels).align(pyramid, pyramid, np.eye(3))
     uv, warps, patches = np.zeros((1, 2)), np.tile(np.eye(2), (1, 1, 1, 1)), np.zeros((1, FLAT_SIZE), np.float32)
     find_deformed(pyramid[1], uv, warps, np.zeros(1, np.int64), patches, 1, 1, uv.copy(), warps[0].copy())
     shutter = RollingShutter(rig)

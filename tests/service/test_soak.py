@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks._soak_attacks import ALONE, ATTACKS, DONE, LOOPS, Turns
 from benchmarks.soak import RATE, Sizes, Watch, growth, judge_memory, main, plan
 
 
@@ -29,6 +30,27 @@ def test_what_a_process_keeps_is_told_from_what_its_jobs_need() -> None:
     assert found["grows"][0].mb_h == pytest.approx(3.0, abs=1e-3) and found["grows"][2] == pytest.approx(2.93, abs=0.05)
     assert found["works"][0].mb_h == pytest.approx(0.0, abs=1e-9) and found["works"][1].mb >= 100.0
     assert judge_memory(watch) == ["grows grows by 3.0 MB an hour"]
+
+
+@pytest.mark.parametrize(
+    ("attacked", "said"),
+    [
+        ((0.02, 0.0, 0.01), []),
+        ((0.30, 0.31, 0.32), ["31.00 % late with attacks, 1.00 without"]),
+        ((0.01,), ["too few turns with poses: 3 alone, 1 with attacks"]),
+    ],
+    ids=["alike", "later", "too few"],
+)
+def test_turns_with_attacks_are_compared_with_turns_alone(
+    attacked: tuple[float, ...], said: list[str], tmp_path: Path
+) -> None:
+    turns = Turns(tmp_path, 0, 0, 0)
+    (tmp_path / DONE).write_text("guesses 1\n")
+    for kind, shares in ((ALONE, (0.0, 0.02, 0.01)), (ATTACKS, attacked), (LOOPS, (1.0,))):
+        for share in shares:
+            late = round(100 * share)
+            turns.delays.append((kind, [0.2] * late + [0.01] * (100 - late)))
+    assert turns.judge() == said
 
 
 @pytest.mark.slow
