@@ -157,7 +157,8 @@ def read_trajectory(path: Path | str) -> Trajectory:
     if not has_stamps(path):
         return read_kitti(path)
     first = _rows(path, 8, alone=True)[0]
-    return read_euroc(path) if first[0].isdigit() and len(first[0]) >= 15 else read_tum(path)
+    in_ns = len(first[0]) >= 15 or "[ns]" in read_text(path).partition("\n")[0]  # whose clock began at its start
+    return read_euroc(path) if first[0].isdigit() and in_ns else read_tum(path)
 
 
 def moved(trajectory: Trajectory, a_T_b: F64) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -37,7 +38,8 @@ def read_times(path: Path) -> Times:
     width = min(map(len, rows), default=0)
     columns = [[row[k] for row in rows] for k in range(width)]
     numbers = [column for column in columns if all(map(_number, column))]
-    times = [column for column in numbers if len(numbers) == 1 or not _counts(column)] or numbers[:1]
+    growing = [column for column in numbers if _grows(column)] or numbers[:1]
+    times = [column for column in growing if not _counts(column)] or growing
     if not times:
         raise StereoSfmError(f"{path} must have one time in seconds or a smaller unit in each line")
     names = next((column for column in columns if not any(map(_number, column))), [])
@@ -57,10 +59,17 @@ def _number(text: str) -> bool:
     return _numeric(text) and Decimal(text).is_finite()
 
 
+def _grows(column: list[str]) -> bool:
+    """Whether numbers ascend, but for a clock that was set back; exposures beside times do not."""
+    up = [Decimal(b) > Decimal(a) for a, b in itertools.pairwise(column)]
+    return 10 * sum(up) >= 9 * len(up)
+
+
 def _counts(column: list[str]) -> bool:
-    """0, 1, 2, ... or 1, 2, 3, ..."""
-    first = column[0]
-    return first in ("0", "1") and column == [str(int(first) + k) for k in range(len(column))]
+    """7, 8, 9, ..., with zeros before them or not."""
+    numbers = [Decimal(text) for text in column if text.isdecimal()]
+    steps = {b - a for a, b in itertools.pairwise(numbers)}
+    return len(numbers) == len(column) and steps <= {1} and numbers[-1] < MIN_STAMP
 
 
 def _stamps_ns(path: Path, texts: list[str]) -> list[int]:

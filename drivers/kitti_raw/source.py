@@ -122,6 +122,7 @@ def _ground_truth(folder: Path, stamps: list[int], imu_T_left: F64) -> Trajector
 
 def _inertial(folder: Path) -> ImuSamples | None:
     """None without oxts and their stamps."""
+    folder = folder.absolute()  # "." has no name
     everything = folder.with_name(folder.name.removesuffix("_sync") + "_extract")
     place = everything if (everything / "oxts" / "timestamps.txt").is_file() else folder
     times = place / "oxts" / "timestamps.txt"

@@ -32,8 +32,10 @@ def test_tum_keeps_every_nanosecond_and_evo_reads_it(trajectory: Trajectory, tmp
     )
 
 
-def test_euroc_round_trip_and_evo(trajectory: Trajectory, tmp_path: Path) -> None:
+@pytest.mark.parametrize("begin_ns", [0, 1_553_180_224_360_915_899])
+def test_euroc_round_trip_and_evo(begin_ns: int, trajectory: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
+    trajectory = Trajectory(trajectory.stamp_ns - trajectory.stamp_ns[0] + begin_ns, trajectory.poses)
     write_euroc(path, trajectory)
     for read in (read_euroc(path), read_trajectory(path)):
         assert read.stamp_ns.tolist() == trajectory.stamp_ns.tolist()
