@@ -189,6 +189,8 @@ class ForeignSource(BaseSource):
         for left, other in itertools.islice(used, FIRST):
             try:
                 self._decoded(0, left, other, 0)
+                if other is not None and self.topics.depth:
+                    self._check_depth(left.message.frame.lstrip("/"), other.message.frame.lstrip("/"))
                 return
             except BAD_MESSAGE as error:
                 why = error
@@ -201,6 +203,14 @@ class ForeignSource(BaseSource):
                 "other. Record both cameras at the same time, with one clock"
             )
         raise StereoSfmError(f"{self.name}: its images cannot be read: {why}")
+
+    def _check_depth(self, frame: str, of_depth: str) -> None:
+        """Warn where depth is another camera's: its pixels do not tell."""
+        if frame and of_depth and frame != of_depth:
+            log.warning(
+                "%s: %s is the depth of %s, not of %s: record it registered to the image, or choose it by ?depth=TOPIC",
+                self.name, self.topics.depth, of_depth, frame,
+            )  # fmt: skip
 
     def _check_size(self, what: str, shape: tuple[int, ...], size: tuple[int, int]) -> None:
         if (shape[1], shape[0]) != size:

@@ -25,7 +25,7 @@ from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, images
 from stereo_sfm.log.reader import Record
-from stereo_sfm.pixels import decode_gray
+from stereo_sfm.pixels import PNG, decode_gray
 from stereo_sfm.types import F32, F64, U8, U16
 
 # Parts of the names that encoders go by (libx264, hevc_nvenc) -> FFmpeg's decoder.
@@ -48,6 +48,7 @@ class ImageMessage:
     step: int = 0
     encoding: str = ""
     big_endian: bool = False
+    inverse: tuple[float, float] | None = None  # of `decode_depth_file`
 
     @property
     def video(self) -> str:
@@ -65,13 +66,16 @@ class ImageMessage:
         if self.video:  # `stereo_sfm.drivers.mcap.video` decodes those of recordings
             raise images.UnknownEncoding(f"'{self.encoding}' is video, which is read from recordings only")
         if self.compressed:
-            return decode_gray(self.data)
+            stated, _, how = self.encoding.partition(";")  # "bayer_rggb8; jpeg compressed": of what was compressed
+            as_it_was = how.partition("compressed")[2].strip() in ("", stated)
+            pixels = decode_gray(self.data)
+            return images.without_mosaic(pixels, stated) if as_it_was else pixels
         return images.decode_raw(self.data, self.width, self.height, self.step, self.encoding, self.big_endian)
 
     def depth(self) -> F32:
         """(H, W) metres, NaN where unknown."""
         if self.compressed:
-            return images.decode_depth_file(self.data)
+            return images.decode_depth_file(self.data, self.inverse)
         return images.decode_depth(self.data, self.width, self.height, self.step, self.encoding)
 
 
@@ -175,9 +179,12 @@ def _image_ros_compressed(data: bytes) -> ImageMessage:
     stamp_ns, frame = cdr.header()
     encoding = cdr.text()
     blob = cdr.blob()
+    inverse: tuple[float, float] | None = None
     if "compressedDepth" in encoding:  # the depth transport has a header before the PNG
-        blob = blob[blob.find(b"\x89PNG") :]
-    return ImageMessage(stamp_ns, frame, True, blob, encoding=encoding)
+        if encoding.startswith("32FC1"):
+            inverse = struct.unpack_from("<ff", blob, 4)
+        blob = blob[max(blob.find(PNG), 0) :]
+    return ImageMessage(stamp_ns, frame, True, blob, encoding=encoding, inverse=inverse)
 
 
 def _video_ros(data: bytes) -> ImageMessage:

@@ -24,6 +24,7 @@ from stereo_sfm.log.reader import TopicInfo
 log = logging.getLogger("stereo_sfm")
 
 _DEPTH = {"depth", "depthmap", "disparity"}  # words of names
+_REGISTERED = {"registered", "aligned", "to"}  # of depth as the colour camera sees it: /depth_to_rgb
 _GYRO, _ACCEL = ("gyro", "gyroscope"), ("accel", "acc", "accelerometer")
 _TRUTH = ("ground_truth", "groundtruth", "mocap", "vicon")
 
@@ -80,12 +81,12 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
         left, found = _pair(str(reader.path), candidates or image_topics, cameras)
         right = right or ("" if depth else found)
     if not right and not depth:
-        depth = next((t for t in image_topics if _is_depth(t) and t != left), "")
+        depth = _depth_topic([t for t in image_topics if _is_depth(t) and t != left])
     return ChosenTopics(
         left,
         right,
         "" if right else depth,
-        next((t.topic for t in rows if t.schema in POSES and any(w in t.topic.lower() for w in _TRUTH)), ""),
+        next((t.topic for t in rows if t.schema in POSES and _is_truth(t.topic)), ""),
         _imu_topics([t.topic for t in rows if t.schema in IMUS]),
         _wheel_topic(str(reader.path), rows, wheel),
         cameras,
@@ -114,7 +115,7 @@ def _wheel_topic(name: str, rows: list[TopicInfo], chosen: str) -> str:
         if chosen not in known:
             raise StereoSfmError(f"{name} has no wheel odometry {chosen} (there is: {', '.join(known) or 'none'})")
         return chosen
-    names = [t.topic for t in rows if t.schema in VELOCITIES]
+    names = [t.topic for t in rows if t.schema in VELOCITIES and not _is_truth(t.topic)]
     return next((t for t in names if any(w.startswith("wheel") for w in words_of(t)) or t.endswith("/odom")), "")
 
 
@@ -137,6 +138,15 @@ def _content(topics: list[TopicInfo]) -> str:
 
 def _is_depth(topic: str) -> bool:
     return not _DEPTH.isdisjoint(words_of(topic))
+
+
+def _depth_topic(topics: list[str]) -> str:
+    """The first, of those that another camera's pixels were computed for if there are any; "" of none."""
+    return min(topics, key=lambda t: _REGISTERED.isdisjoint(words_of(t)), default="")
+
+
+def _is_truth(topic: str) -> bool:
+    return any(word in topic.lower() for word in _TRUTH)
 
 
 def _shared(a: str, b: str) -> int:

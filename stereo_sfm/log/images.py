@@ -161,8 +161,17 @@ def decode_depth(data: bytes, width: int, height: int, step: int, encoding: str)
     return _metres(values) if dtype.kind == "u" else values.astype(np.float32)
 
 
-def decode_depth_file(data: bytes) -> F32:
+def without_mosaic(pixels: U8 | U16, encoding: str) -> U8 | U16:
+    """(H, W) grey of the pixels behind a colour filter; as they are if the encoding is not one of those (bayer_...)."""
+    conversion = _ENCODINGS[encoding][2] if encoding.startswith("bayer_") and encoding in _ENCODINGS else None
+    return pixels if conversion is None else cv2.cvtColor(pixels, conversion).astype(pixels.dtype, copy=False)
+
+
+def decode_depth_file(data: bytes, inverse: tuple[float, float] | None = None) -> F32:
     """Bytes of a sixteen-bit PNG in millimetres -> (H, W) metres, NaN for 0.
+
+    Args:
+        inverse: a and b of pixels that are a / metres + b, as ROS compresses depth in floats.
 
     Raises:
         ValueError: not a depth image.
@@ -173,7 +182,11 @@ def decode_depth_file(data: bytes) -> F32:
         raise ValueError(f"a compressed depth image is not a sixteen-bit PNG: {error}") from None
     if image.dtype != np.uint16 or image.ndim != 2:
         raise ValueError("a compressed depth image is not a sixteen-bit PNG")
-    return _metres(image)
+    if inverse is None:
+        return _metres(image)
+    with np.errstate(divide="ignore"):
+        metres = np.float32(inverse[0]) / (image - np.float32(inverse[1]))
+    return np.where((image > 0) & np.isfinite(metres), metres, np.float32(np.nan))
 
 
 def _metres(millimetres: np.ndarray[Any, Any]) -> F32:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -28,7 +29,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.drivers.mcap.foreign import ForeignSource
-from stereo_sfm.drivers.mcap.messages import IMAGES
+from stereo_sfm.drivers.mcap.messages import IMAGES, ImageMessage
 from stereo_sfm.drivers.mcap.topics import choose_topics
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
@@ -36,7 +37,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.images import UnknownEncoding
-from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.reader import LogReader, TopicInfo
 from stereo_sfm.types import U8
 from tests.log.recordings import fisheye_rig, stereo_images, write_recording
 
@@ -238,6 +239,66 @@ def test_depth_beside_an_image_makes_an_rgbd_source(tmp_path: Path) -> None:
         images = list(source)
     assert images[3].depth is not None and images[3].right is None
     assert np.isnan(images[3].depth[0]).all() and (images[3].depth[1:] == np.float32(2.003)).all()
+
+
+def test_depth_of_the_same_camera_goes_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def image(i: int, side: int, frame: str) -> RawImage:
+        depth = np.full((H, W), 1000 * (side + 1), np.uint16)
+        raw = RawImage(frame_id=frame, width=W, height=H, encoding="16UC1", step=2 * W, data=depth.tobytes())
+        return raw if side else _raw(i, 0, frame)
+
+    topics = ["/camera/rgb/image", "/camera/depth/image", "/camera/depth_registered/image"]
+    frames = ["rgb", "infrared", "rgb"]
+    path = _write(tmp_path / "a.mcap", topics, ["/camera/rgb/info"], frames, image=image, transforms=())
+    with open_source(path) as source:
+        depth = next(iter(source)).depth
+    assert depth is not None and (depth == 3).all() and not caplog.text
+    with open_source(f"mcap:{path}?depth=/camera/depth/image") as source:
+        depth = next(iter(source)).depth
+    assert depth is not None and (depth == 2).all()
+    assert "/camera/depth/image is the depth of infrared, not of rgb" in caplog.text
+
+
+def _compressed(encoding: str, data: bytes) -> ImageMessage:
+    """Of ROS, by its parser."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t, kind = store.types, "sensor_msgs/msg/CompressedImage"
+    header = t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](0, 0), "left")
+    message = t[kind](header, encoding, np.frombuffer(data, np.uint8))
+    return IMAGES[kind](bytes(store.serialize_cdr(message, kind)))
+
+
+def test_compressed_depth_in_floats_is_inverse(tmp_path: Path) -> None:
+    """As ROS's compressed_depth_image_transport writes it: a / metres + b behind a header with a and b."""
+    metres, a, b = np.array([[0.0, 0.5, 1.0, 4.0, 8.0]]), 1e4, -50.0
+    pixels = np.where(metres > 0, a / np.maximum(metres, 0.1) + b, 0).astype(np.uint16)
+    png = cv2.imencode(".png", pixels)[1].tobytes()
+    depth = _compressed("32FC1; compressedDepth png", struct.pack("<iff", 0, a, b) + png).depth()
+    assert np.isnan(depth[0, 0])
+    np.testing.assert_allclose(depth[0, 1:], metres[0, 1:], rtol=1e-3)
+    whole = _compressed("16UC1; compressedDepth", struct.pack("<iff", 0, a, b) + png).depth()
+    np.testing.assert_allclose(whole[0, 1:], pixels[0, 1:] / 1000, rtol=1e-6)
+
+
+def test_what_a_colour_filter_let_through_is_no_image() -> None:
+    """The camera's mosaic compressed as it is; where the format says that colours were made first, it is an image."""
+    mosaic = np.tile(np.array([[200, 100], [100, 40]], np.uint8), (8, 8))
+    png = cv2.imencode(".png", mosaic)[1].tobytes()
+    assert np.ptp(_compressed("bayer_rggb8; png compressed ", png).gray()[2:-2, 2:-2]) == 0
+    assert np.ptp(_compressed("bayer_rggb8; png compressed bayer_rggb8", png).gray()[2:-2, 2:-2]) == 0
+    for encoding in ("bayer_rggb8; png compressed mono8", "mono8; png compressed ", "png"):
+        np.testing.assert_array_equal(_compressed(encoding, png).gray(), mosaic)
+
+
+def test_the_truth_is_no_wheel_odometry() -> None:
+    odometry = "nav_msgs/msg/Odometry"
+    rows = [("/left", "sensor_msgs/msg/Image"), ("/right", "sensor_msgs/msg/Image"), ("/ground_truth/odom", odometry)]
+    for more, wheel in (([], ""), ([("/base/odom", odometry)], "/base/odom")):
+        topics = [TopicInfo(name, kind, "cdr", 1) for name, kind in [*rows, *more]]
+        chosen = choose_topics(SimpleNamespace(topics=topics, path=Path("a.mcap")))  # type: ignore[arg-type]
+        assert (chosen.truth, chosen.wheel) == ("/ground_truth/odom", wheel)
 
 
 def test_ground_truth_by_its_name(tmp_path: Path) -> None:
