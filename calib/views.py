@@ -11,7 +11,7 @@ from stereo_sfm.calib.targets import Detection, Target
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
 from stereo_sfm.pixels import SUFFIXES
-from stereo_sfm.types import U8, StereoImage
+from stereo_sfm.types import U8, U16, StereoImage
 
 _SIDES = ((r"left", "right"), (r"cam0", "cam1"), (r"_0(?=\.)", "_1"), (r"_l(?=\.)", "_r"))
 
@@ -41,14 +41,14 @@ def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
     Raises:
         StereoSfmError: a file is not an image, or the sizes differ.
     """
-    from stereo_sfm.pixels import decode_gray, eight_bits
+    from stereo_sfm.pixels import BitsSoFar, decode_gray, eight_bits
 
-    size: tuple[int, int] = (0, 0)
+    size, used = (0, 0), BitsSoFar()
     for paths in pairs:
-        images: list[U8] = []
+        images: list[U8 | U16] = []
         for path in paths:
             try:
-                image = eight_bits(decode_gray(read_bytes(path)))
+                image = decode_gray(read_bytes(path))
             except (OSError, ValueError):
                 raise StereoSfmError(f"cannot read the image {path}: remove it, or export it again") from None
             found = (image.shape[1], image.shape[0])
@@ -56,7 +56,8 @@ def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
             if found != size:
                 raise StereoSfmError(f"{path} is {found[0]}x{found[1]} px, the other images are {size[0]}x{size[1]}")
             images.append(image)
-        yield images[0], images[1]
+        bits = used.including(images)
+        yield eight_bits(images[0], bits), eight_bits(images[1], bits)
 
 
 def gather(

@@ -7,9 +7,10 @@ gigabytes of pixels.
 from __future__ import annotations
 
 import io
+import logging
 import warnings
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import U8, U16
+
+log = logging.getLogger("stereo_sfm")
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")  # of image files
 MAX_PIXELS = 10**8  # of one image, more than any camera of a rig has
@@ -129,6 +132,22 @@ def sensor_bits(images: Iterable[U16]) -> int:
     if not used & LEFT_ALIGNED and used >> 12:
         return 16
     return max(8, used.bit_length() + used.bit_length() % 2)
+
+
+class BitsSoFar:
+    """How many of 16 bits successive images use: what is white is known from those that came."""
+
+    def __init__(self) -> None:
+        self._bits = 0
+
+    def including(self, images: Sequence[U8 | U16]) -> int:
+        """Bits for `eight_bits`, of these images and those before; those of eight bits do not count."""
+        deep = [image for image in images if image.dtype == np.uint16]
+        bits = max(sensor_bits(deep), self._bits) if deep else self._bits
+        if bits != self._bits:
+            log.warning("16-bit images: the values use %d bits, %d is taken as white", bits, 2**bits - 1)
+            self._bits = bits
+        return bits
 
 
 def eight_bits(image: U8 | U16, bits: int = 16) -> U8:

@@ -46,7 +46,7 @@ from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.images import UnknownEncoding
-from stereo_sfm.pixels import eight_bits
+from stereo_sfm.pixels import BitsSoFar, eight_bits
 from stereo_sfm.types import StereoImage
 
 if TYPE_CHECKING:
@@ -114,6 +114,7 @@ class Ros2Source(BaseSource):
         self._topics = [t for t in (options.left, options.right) if t]
         self.name = f"ros2:{','.join(self._topics)}"
         self._unreadable = Unreadable(self.name, "images could not be read")
+        self._bits = BitsSoFar()
         self._pairs = _Pairs(bool(options.right), int(options.skew_ms * 1e6), self._counters)
         self._infos: dict[str, CameraInfo] = {}
         self._calibrations: tuple[str, str] | None = None  # topics of both cameras', where these are used
@@ -336,12 +337,14 @@ class Ros2Source(BaseSource):
             StereoSfmError: it does not fit the calibration.
         """
         try:
-            pixels = [eight_bits(p.gray()) for p in (left, right) if p is not None]
+            grey = [p.gray() for p in (left, right) if p is not None]
         except UnknownEncoding as error:
             raise StereoSfmError(f"{self.name}: {error}") from None
         except BAD_MESSAGE as error:
             self._unreadable.skip(f"the image at {left.stamp_ns} ns is skipped: {error}")
             return None
+        bits = self._bits.including(grey)
+        pixels = [eight_bits(image, bits) for image in grey]
         for image, camera in zip(pixels, (self.rig.left, self.rig.right), strict=False):
             if camera is not None and image.shape != (camera.height, camera.width):
                 raise StereoSfmError(

@@ -6,7 +6,6 @@ colour in OpenCV's order (blue, green, red), 16-bit grey, and floats from 0 to 1
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import Any
 
@@ -17,10 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.pixels import eight_bits, sensor_bits
+from stereo_sfm.pixels import BitsSoFar, eight_bits
 from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
-
-log = logging.getLogger("stereo_sfm")
 
 
 class ImageInput:
@@ -28,7 +25,7 @@ class ImageInput:
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
-        self._bits = 0  # of 16, used so far
+        self._bits = BitsSoFar()
         self._white = 0.0  # of floats: 1 or 255; 0 before the first
         self._last_ns: int | None = None
         self._count = 0
@@ -107,18 +104,10 @@ class ImageInput:
         if pixels.dtype == np.uint8:
             return np.ascontiguousarray(pixels)
         if pixels.dtype == np.uint16:
-            return eight_bits(np.ascontiguousarray(pixels), self._bits_with(pixels))
+            return eight_bits(np.ascontiguousarray(pixels), self._bits.including([pixels]))
         if np.issubdtype(pixels.dtype, np.floating):
             return self._of_floats(pixels, side)
         raise StereoSfmError(f"the {side} image has {pixels.dtype} pixels: expected uint8, uint16 or floats")
-
-    def _bits_with(self, pixels: NDArray[Any]) -> int:
-        """How many of 16 bits are used, including this image."""
-        bits = max(sensor_bits([pixels]), self._bits)
-        if bits != self._bits:
-            log.warning("16-bit images: the values use %d bits, %d is taken as white", bits, 2**bits - 1)
-            self._bits = bits
-        return bits
 
     def _of_floats(self, pixels: NDArray[Any], side: str) -> U8:
         low, high = float(pixels.min()), float(pixels.max())

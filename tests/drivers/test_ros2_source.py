@@ -7,8 +7,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -21,8 +22,10 @@ from stereo_sfm.drivers.mcap.messages import ImageMessage
 from stereo_sfm.drivers.ros2.source import Ros2Source
 from stereo_sfm.drivers.unreadable import Unreadable
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pixels import BitsSoFar
 from stereo_sfm.system import Tracker
 from stereo_sfm.types import StereoImage
+from tests.synthetic import pinhole_rig
 
 SIMULATED = "sim:loop?size=212x200&frames=20&start=40&camera=pinhole&imu=t265"
 COUNT = 90
@@ -47,6 +50,18 @@ def test_of_many_damaged_images_few_are_said_one_by_one(caplog: pytest.LogCaptur
     assert len(caplog.records) == 5 and "the image at 1 ns is skipped" in caplog.messages[0]
     source._unreadable.end()
     assert "20 images could not be read" in caplog.messages[-1]
+
+
+def test_twelve_of_sixteen_bits_become_eight() -> None:
+    rig = pinhole_rig()
+    source: Any = object.__new__(Ros2Source)
+    source.name, source.rig, source._bits, source._imu, source._imu_lock = "ros2", rig, BitsSoFar(), [], nullcontext()
+    source._options, source._counters = SimpleNamespace(imu=False), SimpleNamespace(add=lambda *a: None)
+    source._wheel = SimpleNamespace(take=lambda stamp_ns: None)
+    pixels = np.resize(np.arange(4096, dtype=np.uint16), (rig.left.height, rig.left.width))
+    size = rig.left.width, rig.left.height, 2 * rig.left.width
+    message = ImageMessage(1, "left", False, pixels.tobytes(), *size, "mono16")
+    np.testing.assert_array_equal(source._image(0, message, message, 0).left, pixels >> 4)
 
 
 class Camera:
