@@ -31,9 +31,7 @@ class Frames:
         self, rs: Any, size: tuple[int, int], counters: Counters, period_ns: int, alternate: bool = False
     ) -> None:
         self._rs, self._size, self._counters = rs, size, counters
-        self._pairer = Pairer(
-            counters, 0 if alternate else period_ns
-        )  # numbers of frames that are left out are missing
+        self._pairer = Pairer(counters, period_ns)
         self._alternate, self._clock, self._other_clock = alternate, "", False
         self.motion = MotionBuffer()
 
@@ -68,7 +66,8 @@ class Frames:
         self._clock = str(frame.get_frame_timestamp_domain())
         exposure_us = self._metadata(frame, "actual_exposure", 0.0)
         gain = self._metadata(frame, "gain_level", _GAIN_ONE) / _GAIN_ONE
-        return CameraImage(self._stamp_ns(frame), frame.get_frame_number(), pixels, exposure_us, gain)
+        number = frame.get_frame_number() // (2 if self._alternate else 1)  # every other one has dots
+        return CameraImage(self._stamp_ns(frame), number, pixels, exposure_us, gain)
 
     def _stamp_ns(self, frame: Any) -> int:
         """Of the middle of the exposure: a frame's stamp is of its readout, half an exposure later."""

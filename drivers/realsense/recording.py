@@ -60,7 +60,8 @@ class RealSenseRecording(BaseSource):
 
     def __iter__(self) -> Iterator[StereoImage]:
         device, _ = self._device()
-        frames = Frames(self._rs, self.rig.left.size, Counters(), round(1e9 / self._rate_hz), self._alternate)
+        period_ns = round((2 if self._alternate else 1) * 1e9 / self._rate_hz)
+        frames = Frames(self._rs, self.rig.left.size, Counters(), period_ns, self._alternate)
         waiting: queue.Queue[Any] = queue.Queue(_WAITING)
         ended, abandoned = threading.Event(), threading.Event()
 

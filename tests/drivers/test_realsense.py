@@ -48,6 +48,7 @@ def test_images_with_dots_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
         images = list(islice(source, 10))
     assert library.sensors[0].options["emitter_on_off"] == 1
     assert [int(image.left[0, 0]) for image in images] == [10, 12, 14, 16, 18] * 2
+    assert not any(image.dropped_before for image in images)
 
 
 def test_a_lost_camera_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
