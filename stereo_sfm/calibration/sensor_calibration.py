@@ -84,15 +84,16 @@ class SensorCalibration:
         """Add a keyframe; returns what is new. `version`: of the map update that brings it."""
         if keyframe.samples is None or not len(keyframe.samples.stamp_ns):
             return None
-        if keyframe.submap_id != self._submap_id:  # its poses do not go with those before
+        if keyframe.submap_id != self._submap_id:  # the next poses do not go with those until then
             self._parts.clear()
             self._submap_id = keyframe.submap_id
+            return None
         if not self._parts:
             self._due_ns = keyframe.stamp_ns + round(FIRST_S * 1e9)
         self._parts.append(keyframe.samples)
-        while keyframe.stamp_ns - int(self._parts[0].stamp_ns[0]) > WINDOW_S * 1e9:
+        while self._parts and keyframe.stamp_ns - int(self._parts[0].stamp_ns[0]) > WINDOW_S * 1e9:
             self._parts.popleft()
-        if keyframe.stamp_ns < self._due_ns:
+        if not self._parts or keyframe.stamp_ns < self._due_ns:  # none: its own begin before a long gap
             return None
         self._due_ns = keyframe.stamp_ns + round(EVERY_S * 1e9)
         return self._compared(keyframe.kf_id, keyframe.stamp_ns, version)

@@ -53,6 +53,10 @@ class Map:
             raise StereoSfmError(f"the map has no keyframe {kf_id}")
         return row
 
+    def row_since(self, kf_id: int) -> int:
+        """Row of the first keyframe from an id on: the keyframe itself, or the next if its row was freed."""
+        return int(np.searchsorted(self.keyframes.kf_id, kf_id))
+
     def point_rows(self, pt_ids: I64) -> I64:
         """(N,) row of each point id after fusions; -1 for an unknown id. Rows of culled points are not alive."""
         rows = self._pt_rows.find(pt_ids)

@@ -244,7 +244,7 @@ class Mapper(AnyMapper):
         if applied:
             self._terms = revision.terms
             changes = [*revision.on_the_way, (revision.since_kf_id, revision.terms)]
-            rigs = [(self.map.kf_row(since), with_terms(self._source_rig, terms)) for since, terms in changes]
+            rigs = [(self.map.row_since(since), with_terms(self._source_rig, terms)) for since, terms in changes]
             recalibrate(self.map, [(0, self.rig), *rigs])
             self.rig = rigs[-1][1]
             self._adjust_since(rigs[0][0])

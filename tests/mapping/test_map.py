@@ -163,8 +163,11 @@ def test_a_map_without_the_rows_of_forgotten_keyframes_is_the_same_map(seed: int
     assert np.array_equal(b.keyframes.kf_id, a.keyframes.kf_id[stay])
     assert np.array_equal(b.keyframe_poses(), a.keyframe_poses()[stay])
     for row in dead[::2].tolist():
+        freed = int(a.keyframes.kf_id[row])
         with pytest.raises(StereoSfmError, match="no keyframe"):
-            b.kf_row(int(a.keyframes.kf_id[row]))
+            b.kf_row(freed)
+        later = b.keyframes.kf_id[b.row_since(freed)]  # the last one is never freed
+        assert later > freed and not ((b.keyframes.kf_id > freed) & (b.keyframes.kf_id < later)).any()
     new = 4 * len(a.keyframes)
     for k in range(len(a.keyframes), len(a.keyframes) + 3):
         for m in (a, b):
