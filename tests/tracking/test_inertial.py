@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +20,10 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.run import run
+from stereo_sfm.tracking.flow.keyframes import Keyframes
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
-from stereo_sfm.tracking.inertial.series import SampleBuffer
+from stereo_sfm.tracking.inertial.series import LONGEST_S, SampleBuffer, Series
 from stereo_sfm.types import F64, I64, Bool, ImuSamples, StereoImage, TrackState
 
 RATE_NS, FRAME_NS = 5_000_000, 50_000_000
@@ -74,6 +77,26 @@ def follow(session: Session, until_s: float, samples: ImuSamples | None = None, 
             noise = np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 1.5e-4, 3)])
             motion.accept(stamp, session.pose(stamp * 1e-9) @ se3.exp(noise))
     return motion
+
+
+def test_samples_do_not_pile_up_while_no_image_has_a_pose() -> None:
+    """Else each image of a night in the dark takes longer than the one before."""
+    series, minute = Series(0.05), np.arange(0, 60 * 10**9, 10**7)
+    for k in range(30):
+        series.add(minute + k * 60 * 10**9, np.zeros((len(minute), 6)))
+    assert len(series.stamp_ns) < 2 * len(minute) * (LONGEST_S / 60 + 1)
+    assert series.edges(28 * 60 * 10**9, 30 * 60 * 10**9 - 10**7) is not None
+
+
+def test_the_first_keyframe_of_a_new_submap_says_nothing_about_gravity() -> None:
+    """Its pose is predicted: the camera may have been tilted while nothing was seen."""
+    down = np.array([0.0, 1.0, 0.0])
+    sensors: Any = SimpleNamespace(links=lambda *a: (None, None), samples=lambda: None, gravity=lambda p: (down, 0.01))
+    keyframes: Any = object.__new__(Keyframes)
+    keyframes._stamp_ns, keyframes._submap_id = 0, 0
+    known = [keyframes._measured(sensors, 10**9, np.eye(4), submap) for submap in (0, 1)]
+    assert known[0]["down"] is down and known[0]["down_sigma"] > 0.01
+    assert "down" not in known[1]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -153,7 +153,7 @@ class Keyframes:
         inertial, wheels = sensors.links(self._stamp_ns if submap_id == self._submap_id else stamp_ns, stamp_ns)
         fields: dict[str, Any] = {"inertial": inertial, "wheels": wheels, "samples": sensors.samples()}
         gravity = sensors.gravity(odom_T_cam)
-        if gravity is not None and self.count > 0:
+        if gravity is not None and submap_id == self._submap_id:  # of a new submap the pose is not measured
             seconds = (stamp_ns - self._stamp_ns) * 1e-9
             fields["down"], fields["down_sigma"] = gravity[0], gravity[1] * np.sqrt(max(CORRELATED_S / seconds, 1.0))
         return fields

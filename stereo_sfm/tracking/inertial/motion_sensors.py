@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
@@ -10,6 +12,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.rest import Rest
+from stereo_sfm.tracking.inertial.series import LONGEST_S
 from stereo_sfm.tracking.inertial.wheel_motion import LINK_NS, WheelMotion
 from stereo_sfm.types import (
     F64,
@@ -34,8 +37,8 @@ class CollectedSamples:
     def __init__(self) -> None:
         self._stamp_ns: list[int] = []
         self._poses: list[F64] = []
-        self._imu: list[ImuSamples] = []
-        self._wheel: list[WheelSamples] = []
+        self._imu: deque[ImuSamples] = deque()
+        self._wheel: deque[WheelSamples] = deque()
 
     def feed(self, image: StereoImage) -> None:
         """The samples up to the image that is tracked next."""
@@ -43,6 +46,9 @@ class CollectedSamples:
             self._imu.append(image.imu)
         if image.wheel is not None and len(image.wheel):
             self._wheel.append(image.wheel)
+        for kept in (self._imu, self._wheel):
+            while kept and image.stamp_ns - int(kept[0].stamp_ns[-1]) > LONGEST_S * 1e9:
+                kept.popleft()
 
     def begin(self) -> None:
         """The odometry begins anew: poses from before do not go with those to come."""

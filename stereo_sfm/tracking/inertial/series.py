@@ -14,6 +14,7 @@ from stereo_sfm.types import F64, I64, ImuSamples
 
 MAX_GAP_S = 0.05  # between inertial samples: longer ones are not bridged
 MEMORY_S = 4.0  # how far back intervals may begin, besides the time since the last pose
+LONGEST_S = 120.0  # without a pose, for which samples are kept: in the dark each image would take longer than the last
 
 
 class Series:
@@ -35,6 +36,8 @@ class Series:
         """The next samples, ascending."""
         self.stamp_ns = np.concatenate([self.stamp_ns, stamp_ns])
         self._values = np.concatenate([self._values, values])
+        if len(self.stamp_ns):
+            self.forget(int(self.stamp_ns[-1]) - round(LONGEST_S * 1e9))
 
     def forget(self, before_ns: int) -> None:
         """Samples from before a time are no longer needed."""
