@@ -56,7 +56,7 @@ def load_runs(folders: Sequence[Path], ref: str | None = None) -> list[ComparedR
     Raises:
         StereoSfmError: one is not the folder of a run, or is named twice.
     """
-    from stereo_sfm.commands.eval import estimate_file, load, own_truth
+    from stereo_sfm.commands.eval import estimate_file, in_cam0, load, own_truth, pose_frame
     from stereo_sfm.drivers.ground_truth import read_trajectory
     from stereo_sfm.eval import compare
 
@@ -69,7 +69,9 @@ def load_runs(folders: Sequence[Path], ref: str | None = None) -> list[ComparedR
         if ref is not None:
             estimate, truth = load(folder, None, ref)
         else:
-            estimate = read_trajectory(estimate_file(folder, None))
+            file = estimate_file(folder, None)
+            estimate = read_trajectory(file)
+            estimate = in_cam0(estimate, file) if pose_frame(file) == "body" else estimate
             try:
                 truth = own_truth(folder)
             except StereoSfmError:

@@ -130,11 +130,11 @@ def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, T
     estimate = _with_stamps(file, reference)
     if truth_file is not None:
         reference = _with_stamps(truth_file, estimate)
-    frame, truth_frame = _pose_frame(file), "cam0" if truth_file is None else _pose_frame(truth_file)
+    frame, truth_frame = pose_frame(file), "cam0" if truth_file is None else pose_frame(truth_file)
     if (frame, truth_frame) == ("body", "cam0"):
-        estimate = _in_cam0(estimate, file)
+        estimate = in_cam0(estimate, file)
     elif (frame, truth_frame) == ("cam0", "body") and truth_file is not None:
-        reference = _in_cam0(reference, truth_file)
+        reference = in_cam0(reference, truth_file)
     return estimate, reference
 
 
@@ -210,7 +210,7 @@ def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
     return read_kitti(path, other.stamp_ns)
 
 
-def _pose_frame(path: Path) -> str:
+def pose_frame(path: Path) -> str:
     """The frame of the poses in a file, "cam0" or "body", by its header or by its run; "" if unknown."""
     from stereo_sfm.export.trajectories import named_pose
 
@@ -226,7 +226,7 @@ def _pose_frame(path: Path) -> str:
         return ""
 
 
-def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
+def in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
     """world_T_body -> world_T_cam0, each with its first pose as the world, by the calibration beside the file."""
     from stereo_sfm.calib import load_rig
     from stereo_sfm.geometry import se3

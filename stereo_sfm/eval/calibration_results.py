@@ -12,12 +12,11 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.calib.wheel_fit import NAMES as WHEEL_NAMES
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.export.run_folder import CORRECTED
 from stereo_sfm.maps.mounting import Mounting, mounted
 from stereo_sfm.tracking.flow.readout import ROLLING
 from stereo_sfm.tracking.flow.sudden_turn import SUSPECTED
 from stereo_sfm.types import CalibrationUpdate, SensorUpdate
-
-CORRECTED = "rig_corrected.yaml"
 
 
 def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:

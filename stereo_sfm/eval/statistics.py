@@ -107,8 +107,8 @@ def statistics(
 
 
 def gravity_stats(record: RunRecord) -> dict[str, float] | None:
-    """Roll and pitch of the map's axes (those of its first camera) against gravity, degrees; None without an IMU."""
-    if not record.down.any():
+    """Roll and pitch of the map's axes (those of its first camera) against gravity, degrees; None if not measured."""
+    if not record.down.any() or not record.down_information:  # a saved map may know it
         return None
     roll, pitch = roll_pitch_deg(record.down)
     return {"roll_deg": roll, "pitch_deg": pitch, "sigma_deg": float(np.degrees(record.down_information**-0.5))}

@@ -14,7 +14,8 @@ from stereo_sfm.folder_lock import FolderLock
 
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
 PLOTS = ("trajectory.png", "errors.png", "tracking.png", "calibration.png", "times.png")
-NUMBERS = ("keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md", "report.html")
+CORRECTED = "rig_corrected.yaml"
+NUMBERS = ("keyframes.tum", "config.toml", "rig.yaml", CORRECTED, "stats.json", "report.md", "report.html")
 KEPT_MAP = "map"  # subfolder with the run's own map
 FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, *NUMBERS, *PLOTS)
 

@@ -13,6 +13,7 @@ import pytest
 
 import stereo_sfm
 from stereo_sfm.cli import main
+from stereo_sfm.commands.compare import load_runs
 from stereo_sfm.drivers.ground_truth import read_kitti, read_tum
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.export.trajectories import write_tum
@@ -103,6 +104,8 @@ def test_eval_of_body_poses(
     assert ate(body, "--ref", camera, capsys=capsys) < 1e-6
     assert ate(body, "--ref", body, capsys=capsys) < 1e-6
     assert ate(body.with_suffix(".kitti"), "--ref", camera, capsys=capsys) < 1e-6  # has no heading
+    of_camera, of_body = (run.estimate.poses for run in load_runs([euroc_run, folder]))
+    assert of_body == pytest.approx(of_camera, abs=1e-6)
     (folder / "rig.yaml").unlink()
     assert main(["eval", str(body), "--ref", str(source)]) == 2
     assert "poses of the body, and there is no rig.yaml" in capsys.readouterr().err

@@ -68,6 +68,15 @@ def results(tmp_path: Path, record: RunRecord, rig: Rig, config: Config) -> tupl
     return stats, summary(stats, evaluations), (tmp_path / "report.md").read_text()
 
 
+def test_gravity_of_a_saved_map_has_no_sigma_of_this_run(tmp_path: Path) -> None:
+    record = record_of(camera_path(), 0)
+    record.down = np.array([0.0, 1.0, 0.0])
+    assert results(tmp_path, record, pinhole_rig(), Config())[0]["gravity"] is None
+    record.down_information = 1e4
+    sigma_deg = results(tmp_path, record, pinhole_rig(), Config())[0]["gravity"]["sigma_deg"]
+    assert sigma_deg == pytest.approx(np.degrees(0.01))
+
+
 def test_one_camera_is_evaluated_after_scale_alignment(tmp_path: Path) -> None:
     config = Config(odometry=dataclasses.replace(Config().odometry, method="pnp", monocular=True))
     assert scale_free(config, pinhole_rig())
