@@ -81,7 +81,7 @@ def _fetch(store: Remote, folder: Path, robot: str) -> int:
     try:
         found = fetch_version(store, released(store, robot), folder)
     except Unreachable as error:
-        kept = version_of(folder)[1]
+        kept = version_of(folder, store)[1]
         if not kept:
             raise
         print(f"warning: {error}: {folder} stays version {kept}", file=sys.stderr)

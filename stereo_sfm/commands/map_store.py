@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import add_config_arguments, load_config, typed
+from stereo_sfm.commands._stop import INTERRUPTED
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -150,6 +151,8 @@ def mapped(name: str, config: Config) -> SavedMap:
         choice = SourceChoice.of(name)
         out = Path(draft) / "run"
         code, folder = execute(RunOptions(choice, config, Wiring(log="none"), MapFolders(), output=out, quiet=True))
+        if code == INTERRUPTED:  # a part of a walk is no session: repeated, the command would find it in the store
+            raise KeyboardInterrupt
         if not (folder / "map" / "map.json").is_file():
             raise StereoSfmError(f"{name} gave no map (exit code {code}): 'stereo-sfm run {name}' says why")
         return load_map(folder / "map")

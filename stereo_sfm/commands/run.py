@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import tempfile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import (
     add_config_arguments,
@@ -17,6 +19,9 @@ from stereo_sfm.commands._options import (
     wiring_of,
 )
 from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from stereo_sfm.storage.remote import Remote
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,38 +66,57 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.commands._execute import RunOptions, execute
     from stereo_sfm.maps.folders import MapFolders
     from stereo_sfm.storage import objects
-    from stereo_sfm.storage.folders import send_folder
     from stereo_sfm.storage.remote import Remote, place
 
     target = None if args.output is None else place(args.output)
     folders = MapFolders(_map_to_read(args.map_in), args.localize_only, _map_to_write(args.map_out))
     folders.check(args.overwrite)
-    with tempfile.TemporaryDirectory(prefix="run") as scratch:
-        if isinstance(target, Remote):
-            objects.listed(target)  # a bucket that is not there is found before anything is computed
-        options = RunOptions(
-            source_choice(args, args.realtime, args.speed, args.camera_store),
-            load_config(args),
-            wiring_of(args),
-            folders,
-            output=Path(scratch) / target.name if isinstance(target, Remote) else target,
-            overwrite=args.overwrite,
-            frame=args.frame,
-            max_lost_percent=args.max_lost,
-            matches=args.matches,
-            quiet=args.quiet,
-            verbose=args.verbose,
-        )
+    if isinstance(target, Remote) and objects.listed(target) and not args.overwrite:  # or there is no such bucket
+        raise StereoSfmError(f"{target} exists: choose another -o, or add --overwrite")
+    options = RunOptions(
+        source_choice(args, args.realtime, args.speed, args.camera_store),
+        load_config(args),
+        wiring_of(args),
+        folders,
+        output=Path(tempfile.mkdtemp(prefix="run")) / target.name if isinstance(target, Remote) else target,
+        overwrite=args.overwrite,
+        frame=args.frame,
+        max_lost_percent=args.max_lost,
+        matches=args.matches,
+        quiet=args.quiet,
+        verbose=args.verbose,
+    )
+    try:
         code, written = execute(options)
         if args.open:
             from stereo_sfm.commands._browser import show
 
             show(written / "report.html")
-        if isinstance(target, Remote):
-            size = send_folder(written, target)
-            if not args.quiet:
-                print(f"sent to {target}: {size / 1e6:.1f} MB")
+    finally:  # what an unplugged camera leaves is a run, too
+        if isinstance(target, Remote) and options.output is not None:
+            _send(options.output, target, args.overwrite, args.quiet)
     return code
+
+
+def _send(folder: Path, target: Remote, overwrite: bool, quiet: bool) -> None:
+    """Send the folder of a run and remove it here, with the folder around it; it stays where it cannot be sent.
+
+    Args:
+        overwrite: files of an earlier run are removed there.
+    """
+    from stereo_sfm.export.run_folder import FILES
+    from stereo_sfm.storage import objects
+    from stereo_sfm.storage.folders import send_folder
+
+    if folder.is_dir() and any(folder.iterdir()):
+        try:
+            size = send_folder(folder, target)
+            objects.delete(target / name for name in FILES if overwrite and not (folder / name).exists())
+        except StereoSfmError as error:
+            raise StereoSfmError(f"{error}: the run is kept in {folder}") from None
+        if not quiet:
+            print(f"sent to {target}: {size / 1e6:.1f} MB")
+    shutil.rmtree(folder.parent, ignore_errors=True)
 
 
 def _map_to_read(name: str | None) -> Path | None:

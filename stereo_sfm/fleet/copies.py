@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+from collections.abc import Set
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,11 +40,12 @@ class Fetched:
     received: int  # bytes of files; the version's own object and the head are 1 to 20 kB besides
 
 
-def version_of(folder: Path) -> tuple[str, int]:
-    """Name and number of the version in a folder; "" and 0 if it is none."""
+def version_of(folder: Path, store: Remote | None = None) -> tuple[str, int]:
+    """Name and number of the version in a folder; "" and 0 if it is none, or one of another store than `store`."""
     try:
         data = read_json(folder / STATE)
-        return str(data["version"]), int(data["number"])
+        mine = store is None or data["store"] == str(store)
+        return (str(data["version"]), int(data["number"])) if mine else ("", 0)
     except (OSError, ValueError, KeyError, TypeError):
         return "", 0
 
@@ -55,11 +58,13 @@ def fetch_version(store: Remote, version: Version, folder: Path) -> Fetched:
     """
     folder = folder.absolute()
     recover(folder)
-    name, before = version_of(folder)
+    name, before = version_of(folder, store)
     mine = {p.name: sha256(p) for p in folder.iterdir() if p.is_file()} if folder.is_dir() else {}
     if name == version.name and all(mine.get(n) == f.sha256 for n, f in version.files.items()):
         return Fetched(version.number, before, 0)
-    known = read_version(store, name).files.keys() if name else ()
+    known: Set[str] = frozenset()
+    with suppress(objects.Missing):  # the store was deleted and begun anew
+        known = read_version(store, name).files.keys() if name else known
     received = 0
     with replaced_folder(folder, frozenset({*version.files, *known, STATE})) as draft:
         for file_name in version.files:
@@ -69,7 +74,7 @@ def fetch_version(store: Remote, version: Version, folder: Path) -> Fetched:
             (draft / file_name).write_bytes(data)
         state = {"store": str(store), "version": version.name, "number": version.number}
         (draft / STATE).write_text(json.dumps(state, indent=1) + "\n", encoding="utf-8")
-    for gone in known - version.files.keys() if name else ():
+    for gone in known - version.files.keys():
         (folder / gone).unlink(missing_ok=True)
     return Fetched(version.number, before, received)
 
@@ -160,7 +165,7 @@ def fetch_released(remote: Remote, robot: str, folder: Path) -> None:
     Raises:
         StereoSfmError: it has none.
     """
-    kept = version_of(folder)[1]
+    kept = version_of(folder, remote)[1]
     try:
         with objects.patience(START_S if kept else objects.PATIENCE_S):
             found = fetch_version(remote, released(remote, robot), folder)

@@ -184,6 +184,35 @@ def test_what_is_read_may_be_in_a_bucket(
     assert (tmp_path / "points.ply").stat().st_size > 1000
 
 
+def test_a_run_that_fails_is_in_the_bucket_and_not_replaced(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from stereo_sfm.commands import _execute
+
+    def unplugged(options: _execute.RunOptions) -> tuple[int, Path]:
+        assert options.output is not None
+        options.output.mkdir()
+        (options.output / "run.mcap").write_bytes(b"what was seen")
+        raise StereoSfmError("the camera was unplugged")
+
+    monkeypatch.setattr(_execute, "execute", unplugged)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    command = ["run", "sim:loop", "-o", f"{place}/walk"]
+    objects.write(Remote.of(place) / "walk" / "stats.json", b"of an earlier run")
+    assert main(command) == 2 and "exists: choose another -o" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 2 and "unplugged" in capsys.readouterr().err
+    assert [name for name, _, _ in objects.listed(Remote.of(place) / "walk")] == [SUMS, "run.mcap"]
+    assert not [*tmp_path.iterdir()]
+
+    def unreachable(*args: object) -> int:
+        raise Unreachable("no network")
+
+    monkeypatch.setattr("stereo_sfm.storage.folders.send_folder", unreachable)
+    assert main([*command, "--overwrite"]) == 2
+    kept = Path(capsys.readouterr().err.strip().rpartition(" ")[2])
+    assert (kept / "run.mcap").read_bytes() == b"what was seen"
+
+
 def test_no_right_to_write_is_one_line(
     place: str, s3: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,7 @@ import pytest
 from stereo_sfm.arrays import write_arrays
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet import copies
-from stereo_sfm.fleet.copies import fetch_version, version_of
+from stereo_sfm.fleet.copies import fetch_released, fetch_version, version_of
 from stereo_sfm.fleet.editing import checked_out
 from stereo_sfm.fleet.versions import (
     StoredFile,
@@ -70,6 +70,22 @@ def test_a_robot_fetches_what_has_changed(place: str, tmp_path: Path) -> None:
     late = fetch_version(store, current(store), robot)  # offline for three nights
     assert content(robot) == content(made) and late.received < 0.45 * first.received
     assert version_of(robot)[1] == 5 and [v.number for v in history(store)] == [5, 4, 3, 2, 1]
+
+
+def test_a_folder_of_another_store_becomes_this_one(place: str, tmp_path: Path) -> None:
+    """Moved to another shop, or the store was begun anew: never the map of the one before."""
+    robot = tmp_path / "robot"
+    for night, name in enumerate(("here", "there")):
+        publish_night(Remote.of(place) / name, tmp_path / name, night)
+        fetch_released(Remote.of(place) / name, "", robot)
+        assert content(robot) == content(tmp_path / name)
+    with pytest.raises(objects.Missing):
+        fetch_released(Remote.of(place) / "nowhere", "", robot)
+    store = Remote.of(place) / "there"
+    objects.delete(store / name for name, _, _ in objects.listed(store))
+    publish_night(store, tmp_path / "anew", 2)
+    fetch_released(store, "", robot)
+    assert content(robot) == content(tmp_path / "anew")
 
 
 def test_a_second_writer_is_refused_and_writes_nothing(place: str, tmp_path: Path) -> None:

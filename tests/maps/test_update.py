@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
+from stereo_sfm.commands._stop import INTERRUPTED
 from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -228,6 +229,20 @@ def test_labels_and_plans_while_a_service_extends_the_map(tmp_path: Path) -> Non
         assert main(["map", "update", str(store), str(store)]) == 2
     assert [aisle.name for aisle in read_about(store).aisles] == ["aisle 4"]
     assert (store / "floor_plan.pgm").exists() and same(load_map(store).snapshot, saved.snapshot)
+
+
+def test_a_walk_that_was_interrupted_is_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the command cannot be repeated: a part of the walk is in the store."""
+    from stereo_sfm.commands import _execute
+
+    def stopped(options: _execute.RunOptions) -> tuple[int, Path]:
+        assert options.output is not None
+        save_map(small_map()[1], options.output / "map")
+        return INTERRUPTED, options.output
+
+    monkeypatch.setattr(_execute, "execute", stopped)
+    assert main(["map", "update", str(tmp_path / "store"), "sim:loop"]) == INTERRUPTED
+    assert not (tmp_path / "store").exists()
 
 
 def test_a_map_that_is_replaced_while_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
