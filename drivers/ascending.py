@@ -18,7 +18,7 @@ import numpy as np
 from stereo_sfm.drivers.repeated import shifted
 from stereo_sfm.drivers.source import Stamps
 from stereo_sfm.drivers.wrapped import WrappedSource
-from stereo_sfm.types import ImuSamples, StereoImage, WheelSamples
+from stereo_sfm.types import StereoImage
 
 log = logging.getLogger("stereo_sfm")
 
@@ -84,7 +84,8 @@ def ascending(images: Iterable[StereoImage], name: str) -> Iterator[StereoImage]
                 name, waiting[-len(stamps)].frame_id, clock.shift_ns * 1e-9,
             )  # fmt: skip
         while len(waiting) > len(stamps) > 0:
-            waiting[:2] = [_joined(waiting[0], waiting[1])]
+            skipped = waiting.pop(0)
+            waiting[0] = waiting[0].following([skipped], 1 + skipped.dropped_before)
         for good, stamp_ns in zip(waiting if stamps else (), stamps, strict=True):
             yield _stamped(good, stamp_ns)
         waiting = [] if stamps else waiting
@@ -97,18 +98,6 @@ def _stamped(image: StereoImage, stamp_ns: int) -> StereoImage:
     """On the ascending clock: another one for the samples, too."""
     shift_ns = stamp_ns - image.stamp_ns
     return image if not shift_ns else shifted(image, image.frame_id, shift_ns)
-
-
-def _joined(skipped: StereoImage, image: StereoImage) -> StereoImage:
-    """An image with the samples and the lost images of one that is skipped before it."""
-    imu = [x.imu for x in (skipped, image) if x.imu is not None]
-    wheel = [x.wheel for x in (skipped, image) if x.wheel is not None]
-    return replace(
-        image,
-        dropped_before=skipped.dropped_before + 1 + image.dropped_before,
-        imu=ImuSamples.joined(imu) if imu else None,
-        wheel=WheelSamples.joined(wheel) if wheel else None,
-    )
 
 
 class AscendingSource(WrappedSource):

@@ -10,7 +10,7 @@ from stereo_sfm.types import StereoImage
 
 
 class ReplayedSource(WrappedSource):
-    """Passes on another source's frames whose ids are in `frame_ids`."""
+    """Passes on another source's frames whose ids are in `frame_ids`, with the samples of those between."""
 
     def __init__(self, source: Source, frame_ids: Collection[int]) -> None:
         super().__init__(source)
@@ -25,4 +25,13 @@ class ReplayedSource(WrappedSource):
         return len(self._frame_ids)
 
     def __iter__(self) -> Iterator[StereoImage]:
-        return (image for image in self.source if image.frame_id in self._frame_ids)
+        left_out: list[StereoImage] = []
+        last = max(self._frame_ids, default=-1)
+        for image in self.source:
+            if image.frame_id in self._frame_ids:
+                yield image.following(left_out)
+                left_out = []
+            else:
+                left_out.append(image.without_pixels())
+            if image.frame_id >= last:  # what follows may be damaged, or take hours
+                return

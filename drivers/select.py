@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import ImuSamples, StereoImage, WheelSamples
+from stereo_sfm.types import StereoImage
 
 MAX_DURATION_S = 1e9  # of any source
 
@@ -54,30 +53,21 @@ class SelectedFrames(WrappedSource):
 
     def __iter__(self) -> Iterator[StereoImage]:
         passed, seen, dropped, since = 0, 0, 0, 0
-        imu: list[ImuSamples] = []  # since the last frame that was passed on
-        wheel: list[WheelSamples] = []
+        left_out: list[StereoImage] = []  # since the last frame that was passed on
         first_ns: int | None = None
         for image in self.source:
             first_ns = image.stamp_ns if first_ns is None else first_ns
             since = image.stamp_ns - first_ns
-            if image.imu is not None:
-                imu.append(image.imu)
-            if image.wheel is not None:
-                wheel.append(image.wheel)
             if self.end_ns is not None and since >= self.end_ns:
                 break
-            if since < self.start_ns:
+            early = since < self.start_ns
+            seen += not early
+            if early or (seen - 1) % self.frame_skip:
+                left_out.append(image.without_pixels())
+                dropped += 0 if early else image.dropped_before
                 continue
-            dropped += image.dropped_before
-            seen += 1
-            if (seen - 1) % self.frame_skip:
-                continue
-            if len(imu) > 1:
-                image = replace(image, imu=ImuSamples.joined(imu))
-            if len(wheel) > 1:
-                image = replace(image, wheel=WheelSamples.joined(wheel))
-            yield image if dropped == image.dropped_before else replace(image, dropped_before=dropped)
-            dropped, imu, wheel = 0, [], []
+            yield image.following(left_out, dropped)
+            dropped, left_out = 0, []
             passed += 1
             if passed == self.max_frames:
                 return

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,6 +27,7 @@ Bool = NDArray[np.bool_]
 
 
 RIG_TERMS = 8  # of `CalibrationUpdate`
+LEFT_OUT = 1000  # images at most, the last ones, whose samples come with the next one where a stage is too slow
 FAILED = "error: "  # begins the reason of a `LoopResult` where the loop closer failed
 
 
@@ -152,6 +153,27 @@ class StereoImage(Message):
     dropped_before: int = 0  # frames the sensor or the driver lost just before this one
     imu: ImuSamples | None = None  # since the image before
     wheel: WheelSamples | None = None  # since the image before
+
+    def without_pixels(self) -> StereoImage:
+        """What is kept of an image that is left out."""
+        return replace(self, left=np.zeros((0, 0), np.uint8), right=None, depth=None)
+
+    def following(self, left_out: Sequence[StereoImage], lost: int = 0) -> StereoImage:
+        """The image with the samples of the images before it that are left out, so that none is missing.
+
+        Args:
+            lost: how many more images it says were dropped before it.
+        """
+        if not left_out:
+            return self
+        imu = [image.imu for image in (*left_out, self) if image.imu is not None]
+        wheel = [image.wheel for image in (*left_out, self) if image.wheel is not None]
+        return replace(
+            self,
+            dropped_before=self.dropped_before + lost,
+            imu=ImuSamples.joined(imu) if imu else None,
+            wheel=WheelSamples.joined(wheel) if wheel else None,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
 from stereo_sfm.pipeline.stages import sensor_drop, source_counters, start_check
 from stereo_sfm.pipeline.watchdog import HeartbeatThread
-from stereo_sfm.types import Dropped, StartCheck, StereoImage, Trajectory
+from stereo_sfm.types import LEFT_OUT, Dropped, StartCheck, StereoImage, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +165,7 @@ class CaptureStage:
 
     def _read(self) -> None:
         meter = HealthMeter("capture", self.to_main.send)
+        left_out: deque[StereoImage] = deque(maxlen=LEFT_OUT)
         for image in self._images():
             if self.stop.requested:
                 break
@@ -176,8 +177,10 @@ class CaptureStage:
             if free is None:
                 meter.dropped += 1
                 self.to_main.send(Dropped(image.frame_id, image.stamp_ns, "ring", "no free slot: a stage is too slow"))
+                left_out.append(image.without_pixels())
                 continue
-            message = pickled(self._put(*free, image, begin))
+            message = pickled(self._put(*free, image.following(left_out), begin))
+            left_out.clear()
             self.to_tracker.send(message)
             self.to_main.send(message)
             self._send_depth(image, free[0], message)

@@ -27,7 +27,7 @@ from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbnail
 from stereo_sfm.recording.segments import RECORDING, Segment, about, describe, new_recording
-from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage, WheelSamples
+from stereo_sfm.types import LEFT_OUT, Dropped, Frame, Observations, StereoImage
 
 EVERY_S = 2.0  # between two checks of the disk, besides those at the beginning of a segment
 SLOW_S = 5.0  # after an image was dropped the disk counts as slow
@@ -93,7 +93,7 @@ class SegmentRecorder:
         self._history: deque[tuple[Segment, int]] = deque()  # what a mark may reach; with the stamp of its beginning
         self._marks: dict[str, int] = {}  # text -> stamp until which new segments are marked with it
         self._next_thumbnail_ns = 0
-        self._missed: list[StereoImage] = []  # images dropped since the last one kept, without their pixels
+        self._missed: deque[StereoImage] = deque(maxlen=LEFT_OUT)  # images dropped since the last one kept
         self.images_dropped, self._dropped_s = 0, -SLOW_S
         self._used = used_bytes(policy.root)
         self._no_room, self._only_marked = "", ""
@@ -117,19 +117,18 @@ class SegmentRecorder:
             self._poses.put(Thumbnail(image))
         if self._policy.mode == "lean":
             return True
-        if self._no_room or not self._images.put(self._with_missed(image)):
+        if self._no_room or not self._images.put(self._following_missed(image)):
             self._dropped_s = time.monotonic()
             self.omit(image, self._no_room or self._images.problem or "the disk is slow")
             return False
-        self._missed = []
+        self._missed.clear()
         return True
 
     def omit(self, image: StereoImage, why: str) -> None:
         """An image that is not recorded: the recording says why, and its samples come with the next one."""
         self._next_segment_if_due(image.stamp_ns)
         self.images_dropped += 1
-        self._missed.append(replace(image, left=image.left[:0], right=None, depth=None))
-        del self._missed[:-1000]
+        self._missed.append(image.without_pixels())
         self._poses.put(Dropped(image.frame_id, image.stamp_ns, "log", why))
 
     def put(self, message: object) -> None:
@@ -204,18 +203,9 @@ class SegmentRecorder:
                 with contextlib.suppress(OSError):
                     self.segment.mark(text)
 
-    def _with_missed(self, image: StereoImage) -> StereoImage:
+    def _following_missed(self, image: StereoImage) -> StereoImage:
         """An image with the number of images dropped before it, and their inertial and wheel samples."""
-        if not self._missed:
-            return image
-        samples = [i.imu for i in (*self._missed, image) if i.imu is not None]
-        wheel = [i.wheel for i in (*self._missed, image) if i.wheel is not None]
-        return replace(
-            image,
-            dropped_before=image.dropped_before + sum(1 + i.dropped_before for i in self._missed),
-            imu=ImuSamples.joined(samples) if samples else None,
-            wheel=WheelSamples.joined(wheel) if wheel else None,
-        )
+        return image.following(self._missed, sum(1 + missed.dropped_before for missed in self._missed))
 
     # -- the disk ----------------------------------------------------------------------------------------------------
 

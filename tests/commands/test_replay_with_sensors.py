@@ -16,7 +16,7 @@ from tests.sensor_drive import miscalibrated
 SPEC = "sim:loop?size=212x200&rate=10&start=60&frames=32&imu=t265&wheel=differential&dark=8-8.5"
 
 
-@pytest.mark.parametrize("live", [(), ("--realtime",)])
+@pytest.mark.parametrize("live", [(), ("--realtime",), ("--start", "0.5", "--frame-skip", "2")])
 def test_a_run_over_processes_is_replayed_inline(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], live: tuple[str, ...]
 ) -> None:
