@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from stereo_sfm.calib.formats import load_rig
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.ascending import ascending
 from stereo_sfm.drivers.checked_samples import SampleChecker
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
@@ -134,15 +135,15 @@ class System:
             sinks: each gets every message, in order.
         """
         self.rig, self.config = _rig(rig), config or Config()
-        folders = MapFolders(None if map_in is None else Path(map_in).expanduser(), localize_only)
-        folders.check()
+        self._folders = MapFolders(None if map_in is None else Path(map_in).expanduser(), localize_only)
+        self._folders.check()
         self._record, self._view = RunRecord.of(self.config, localize_only), MapView()
         self._callbacks = _Callbacks()
         self._map_T_odom: F64 = np.eye(4)
         self._callbacks.add(MapUpdate, self._take)
         self._input, self._samples = ImageInput(self.rig), SampleChecker()
         every = (self._record, self._callbacks, *sinks)
-        self._run = InlineRun(MemorySource(self.rig, []), self.config, every, folders=folders)
+        self._run = InlineRun(MemorySource(self.rig, []), self.config, every, folders=self._folders)
         self._open = ExitStack()
         self._open.enter_context(Listener("main", self._run.add_line))
         self._open.enter_context(limited_threads(self.config.pipeline.threads))
@@ -173,8 +174,8 @@ class System:
         return self.frame
 
     def run(self, images: Iterable[StereoImage]) -> Iterator[Frame]:
-        """Every image through all stages; finishes after the last one."""
-        for image in images:
+        """Every image through all stages, with ascending stamps as in a run; finishes after the last one."""
+        for image in ascending(images, "images"):
             yield self.step_image(image)
         self.finish()
 
@@ -205,8 +206,9 @@ class System:
 
     @property
     def map_T_cam(self) -> F64 | None:
-        """(4, 4) the newest image's pose in the map; None before the first pose."""
-        known = self.frame is not None and bool(self._record.tracked().any())
+        """(4, 4) the newest image's pose in the map; None before the first pose, and until `map_in` is recognised."""
+        placed = self._folders.map_in is None or self._run.map_stage.mapper.found
+        known = self.frame is not None and placed and bool(self._record.tracked().any())
         return self._map_T_odom @ self.frame.odom_T_cam if known and self.frame is not None else None
 
     @property

@@ -65,6 +65,25 @@ def test_samples_of_imu_and_wheels_are_handed_over_with_the_images(caplog: pytes
     assert "doubled" in caplog.text
 
 
+def test_the_callers_arrays_stay_its_own(recording: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, images = recording
+    tracker, other = s.Tracker(rig), s.Tracker(rig)
+    left, right = np.empty_like(images[0].left), np.empty_like(images[0].left)
+    for image in images[:4]:
+        assert image.right is not None
+        left[:], right[:] = image.left, image.right
+        own = tracker.step(left, right, image.stamp_ns)
+        left[:], right[:] = 0, 0
+        assert own.odom_T_cam.tobytes() == other.step(image.left, image.right, image.stamp_ns).odom_T_cam.tobytes()
+
+
+def test_images_that_a_source_repeats_are_skipped(recording: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, images = recording
+    with s.System(rig) as system:
+        frames = list(system.run([*images[:3], images[2], images[3]]))
+    assert [frame.frame_id for frame in frames] == [0, 1, 2, 3]
+
+
 def test_odometry_alone_is_the_same_odometry(recording: tuple[s.Rig, list[s.StereoImage]]) -> None:
     """Until the first map update arrives."""
     rig, images = recording
@@ -85,6 +104,13 @@ def test_a_map_is_saved_loaded_and_queried(recording: tuple[s.Rig, list[s.Stereo
     known = system.trajectory().poses[6]
     assert np.linalg.norm(answer.map_T_cam[:3, 3] - known[:3, 3]) < 0.02
     assert locator.locate(images[6].left, images[6].right, near=known).found
+    elsewhere = s.System(rig, map_in=tmp_path / "store", localize_only=True)
+    for image in images[:4]:  # upside down nothing is recognised
+        assert image.right is not None
+        elsewhere.step(image.left[::-1], image.right[::-1], image.stamp_ns)
+        assert elsewhere.map_T_cam is None
+    assert elsewhere.frame is not None and elsewhere.frame.state == s.TrackState.OK
+    elsewhere.finish()
     black = np.zeros_like(images[6].left)
     assert locator.locate(black, black).reason == "too_few_points"
     with pytest.raises(s.StereoSfmError, match="unknown map format 'kolmap', did you mean colmap"):

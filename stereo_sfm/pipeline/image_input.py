@@ -124,7 +124,7 @@ class ImageInput:
 
 def _array(pixels: ArrayLike, side: str) -> NDArray[Any]:
     try:
-        return np.asarray(pixels)
+        return np.array(pixels)  # a copy: the caller may write the next image into its own
     except (ValueError, TypeError):
         raise StereoSfmError(f"the {side} image is not an array of numbers") from None
 
