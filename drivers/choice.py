@@ -102,6 +102,7 @@ class SourceChoice:
         start: the first images are not compared with the calibration (unchecked), or they are (checked), and correct it
             where they contradict it (corrected).
         start_check: what an earlier run's first images said, which is not found out again.
+        paired: the images are paired as it says already.
     """
 
     spec: str
@@ -114,6 +115,7 @@ class SourceChoice:
     camera_store: Path | None = None
     start: str = "unchecked"
     start_check: StartCheck | None = None
+    paired: bool = False
 
     @staticmethod
     def of(
@@ -181,7 +183,7 @@ class SourceChoice:
                 log.warning("%s: %s", source.name, doubt)
         source = rectified(source, RECTIFY[self.rectify])
         if self.start != "unchecked" or self.start_check is not None:
-            source = StartCheckedSource(source, self.start == "corrected", self.start_check)
+            source = StartCheckedSource(source, self.start == "corrected", self.start_check, self.paired)
         source = RepeatedSource(source) if self.repeat else source
         return source if self.speed is None else PacedSource(source, self.speed)
 

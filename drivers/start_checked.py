@@ -38,13 +38,15 @@ class StartCheckedSource(WrappedSource):
     (`RigChanged`).
     """
 
-    def __init__(self, source: Source, correct: bool, known: StartCheck | None = None) -> None:
+    def __init__(self, source: Source, correct: bool, known: StartCheck | None = None, paired: bool = False) -> None:
         """Args:
         source: the source.
         correct: use a corrected calibration; else it is only reported.
         known: what an earlier run of the same images found: nothing is looked at again.
+        paired: the images are paired as it says already, as those of its log are.
         """
         super().__init__(source)
+        self._paired = paired
         self._correct, self._check = correct, known
         self._looked_at = known is not None
         self._images: Iterator[StereoImage] | None = None  # a begun iteration, from the first image on
@@ -124,7 +126,7 @@ class StartCheckedSource(WrappedSource):
 
     @property
     def _shift(self) -> int:
-        return 0 if self._check is None else self._check.right_shift
+        return 0 if self._check is None or self._paired else self._check.right_shift
 
     def __iter__(self) -> Iterator[StereoImage]:
         handed_out = self.rig

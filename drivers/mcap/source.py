@@ -182,7 +182,7 @@ class McapSource(BaseSource):
     def __init__(self, reader: LogReader, rig: RigOption = None) -> None:
         """Takes over the reader. `rig` replaces the recorded calibration."""
         self.reader = reader
-        reader.by_time = not reader.set_back  # frames are written in their order
+        reader.by_time = False  # frames are written in their order; samples may be of another clock
         self.name = str(reader.path)
         self.rig = chosen_rig(rig, self._recorded_rig)
         self._check_cameras()

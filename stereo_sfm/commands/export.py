@@ -166,7 +166,8 @@ def _write_with_images(saved: SavedMap, output: Path, options: ExportOptions, im
     check_session(saved, options.session)
     sessions = saved.session_ids if options.session is None else [options.session]
     cameras = [saved.cameras[session] for session in sessions]
-    source = open_recording(images, cameras, load_rig(options.rig) if options.rig is not None else None)
+    own_rig = load_rig(options.rig) if options.rig is not None else None
+    source = open_recording(images, cameras, own_rig, options.source)
     with source:
         session = options.session if options.session is not None else session_of_recording(saved, source, images)
         export_map(saved, output, "colmap")

@@ -77,7 +77,7 @@ class ReplayOptions:
 
 def run(args: argparse.Namespace) -> int:
     """Read the run, repeat it, and compare if asked to."""
-    if args.realtime or args.speed is not None:
+    if args.realtime or args.mode == "realtime" or args.speed is not None:
         raise StereoSfmError("a replay takes its timing from the run: --realtime and --speed go with 'run'")
     wiring = wiring_of(args)
     if args.check and wiring.log == "none":
@@ -115,6 +115,7 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
     """The run of a log as options."""
     from stereo_sfm.commands._execute import RunOptions
     from stereo_sfm.drivers.choice import ReplayChoice
+    from stereo_sfm.drivers.source import is_device
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.log.reader import LogReader
 
@@ -131,6 +132,8 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
     follow = options.schedule == "recorded" or (options.schedule is None and before.mode == "realtime")
     logged = options.source is None and before.image_format != "none"  # the images that the tracker saw
     spec = str(path) if logged else options.source or before.source
+    if not logged and is_device(spec):
+        raise StereoSfmError(f"{path} has no images, and its source {spec} is a camera: run it with --log full")
     rig, rectify = (None, "none") if logged else (before.opening.rig, before.opening.rectify)
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], options.until))
     return RunOptions(
@@ -139,6 +142,7 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
             rig,
             rectify=rectify,
             start_check=before.start_check,
+            paired=logged,
             frame_ids=frame_ids,
             recorded_skip=before.opening.frame_skip,
         ),
@@ -191,7 +195,8 @@ def _compare(run: Path, replay: Path) -> int:
     images = (topics.IMAGE_INFO, topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE, topics.IMU, topics.WHEEL,
               topics.FEATURES)  # fmt: skip
     with LogReader(run) as a, LogReader(replay) as b:
-        not_logged = set(images) - {t.topic for t in b.topics}  # read by the replay, but not logged without --log full
+        both = {t.topic for t in a.topics} & {t.topic for t in b.topics}
+        not_logged = set(images) - both  # read, but not logged without --log full
         differences = [d for d in diff(a, b) if d.topic not in not_logged]
         same = "identical"
         if ended_early(a):  # the replay ends with the last logged frame, where the mapper of the run continued

@@ -24,6 +24,7 @@ class DenseInput:
     saved: SavedMap
     recordings: tuple[str, ...]
     rig: Path | None  # calibration of the recordings instead of their own
+    run: Path | None = None  # folder of the run over them, if it is known
 
 
 def find_input(folder: Path, images: Sequence[str] = (), rig: Path | None = None) -> DenseInput:
@@ -37,7 +38,7 @@ def find_input(folder: Path, images: Sequence[str] = (), rig: Path | None = None
     place = folder / RUN_MAP if (folder / RUN_MAP / "map.json").is_file() else folder
     saved = load_map(place)
     recordings = tuple(images) or _own_images(folder)
-    return DenseInput(saved, recordings, rig)
+    return DenseInput(saved, recordings, rig, folder)
 
 
 def _own_images(folder: Path) -> tuple[str, ...]:
@@ -71,7 +72,7 @@ def keyframes(given: DenseInput) -> Iterator[KeyframeImages]:
     cameras = [saved.cameras[session] for session in saved.session_ids]
     own = load_rig(given.rig) if given.rig is not None else None
     for spec in given.recordings:
-        with open_recording(spec, cameras, own) as source:
+        with open_recording(spec, cameras, own, given.run) as source:
             session = session_of_recording(saved, source, spec)
             rows = {
                 (int(s.frame_ids[k]), int(s.stamp_ns[k])): k for k in range(len(saved)) if saved.sessions[k] == session

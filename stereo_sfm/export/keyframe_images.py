@@ -9,32 +9,37 @@ from stereo_sfm.calib.rectification import PROJECTIONS
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.rectified import rectified
 from stereo_sfm.drivers.source import Source, open_source
+from stereo_sfm.drivers.start_checked import StartCheckedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
 from stereo_sfm.maps.cameras import MapCamera, difference
 from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.types import U8, StereoImage
+from stereo_sfm.types import U8, StartCheck, StereoImage
 
 Key = tuple[int, int]  # frame id, stamp in ns
 
 
-def open_recording(spec: str, cameras: Sequence[MapCamera], own_rig: Rig | None = None) -> Source:
+def open_recording(
+    spec: str, cameras: Sequence[MapCamera], own_rig: Rig | None = None, run: Path | None = None
+) -> Source:
     """A recording, not yet entered, as seen by a camera of the map: unchanged, or rectified as in the run.
 
     Args:
         spec: the recording.
         cameras: of the map; as it was calibrated, or as corrected.
         own_rig: calibration that replaces the recording's own.
+        run: folder of the run that made the map; what its first images said holds here, too.
 
     Raises:
         StereoSfmError: it was recorded with another camera.
     """
-    source = open_source(spec, own_rig)
+    source, check = open_source(spec, own_rig), None if run is None else _start_check(run, spec)
     for how in PROJECTIONS:
         try:
             seen = rectified(source, how)
         except StereoSfmError:  # one camera, or two that cannot be rectified this way
             continue
+        seen = seen if check is None else StartCheckedSource(seen, False, check)
         if not all(difference(rig, seen.rig, corrected=True) for c in cameras for rig in (c.calibrated, c.rig)):
             return seen
     other = difference(cameras[-1].rig, source.rig)
@@ -42,6 +47,18 @@ def open_recording(spec: str, cameras: Sequence[MapCamera], own_rig: Rig | None 
         f"the camera of {spec} is not the map's, rectified or not (it has {other}): give"
         " the recording of this map, and the --rig of its run if any"
     )
+
+
+def _start_check(run: Path, spec: str) -> StartCheck | None:
+    """What the first images of a run said; None for those of its own log, which are paired and calibrated by that."""
+    from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.log.recorded import read_run
+
+    log = run / "run.mcap"
+    if not log.is_file() or Path(spec).absolute() == log.absolute():
+        return None
+    with LogReader(log) as reader:
+        return read_run(reader).start_check
 
 
 def check_session(saved: SavedMap, session: int | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import logging
 import struct
 import zlib
@@ -221,12 +220,6 @@ class LogReader:
         if indexed is None:
             return np.array([r.log_time for r in self.messages([topic])], np.int64)
         return np.sort(np.concatenate([np.zeros(0, np.int64), *indexed]))
-
-    @property
-    def set_back(self) -> bool:
-        """Whether the clock goes back from one part of the file to the next, by the index alone."""
-        chunks = sorted(self.summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
-        return any(b.message_end_time < a.message_end_time for a, b in itertools.pairwise(chunks))
 
     def step_back_ns(self, topic: str) -> int:
         """How far the log time goes back at most from one message of a topic to the next; 0 without an index."""

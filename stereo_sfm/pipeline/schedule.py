@@ -54,13 +54,15 @@ class Recorded:
 
     def __init__(self, applied: Sequence[Applied]) -> None:
         self._due = deque(sorted(applied, key=lambda a: a.version))
+        self._coming = 0  # one for each keyframe: a repeat that differs has none to wait for where the run had one
 
     def keyframe(self, frame_index: int) -> None:
-        pass
+        self._coming += 1
 
     def due(self, frame_index: int, frame_id: int) -> int | None:
         count = 0
-        while self._due and self._due[0].before_frame_id <= frame_id:
+        while self._due and count < self._coming and self._due[0].before_frame_id <= frame_id:
             self._due.popleft()
             count += 1
+        self._coming -= count
         return count

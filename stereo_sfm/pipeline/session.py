@@ -187,8 +187,10 @@ class Session:
         return LogOptions(folder / LOG, pixels if kind == "full" else "none")
 
     def _ring_drops(self) -> list[Dropped]:
-        """Images that the run to be repeated dropped because it was too slow."""
-        return [] if self._replayed is None else [d for d in self._replayed.dropped if d.where == "ring"]
+        """Images that the run to be repeated dropped because it was too slow, and those lost before them."""
+        drops = [] if self._replayed is None else self._replayed.dropped
+        ids = {drop.frame_id for drop in drops if drop.where == "ring"}
+        return [d for d in drops if d.where == "ring" or (d.where == "sensor" and d.frame_id + d.count in ids)]
 
     @property
     def _depth_frames(self) -> frozenset[int] | None:

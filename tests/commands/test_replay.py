@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from stereo_sfm.cli import main
+from stereo_sfm.log import recorded
 
 SPEC = "sim:aisle?camera=pinhole&size=320x200&rate=10&frames=8"
 
@@ -101,13 +103,30 @@ def test_the_log_of_a_killed_run_is_compared_as_far_as_it_goes(
                  "--set", "tracker.max_features=150"]) == 3  # fmt: skip
 
 
-@pytest.mark.parametrize("options", [("--realtime",), ("--speed", "2"), ("--check", "--until", "1")])
+@pytest.mark.parametrize(
+    "options", [("--realtime",), ("--mode", "realtime"), ("--speed", "2"), ("--check", "--until", "1")]
+)
 def test_options_without_effect_in_a_replay(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
 ) -> None:
     assert main(["replay", str(run), "-o", str(tmp_path / "c"), *options]) == 2
     assert options[-2 if options[-1].isdigit() else -1] in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
+
+
+def test_more_is_logged_than_in_the_run(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["-o", str(tmp_path / "c"), "--check", "--inline", "--log", "full", "-q"]
+    assert main(["replay", str(run), *options]) == 0 and capsys.readouterr().out == "identical\n"
+
+
+def test_a_camera_is_not_replayed(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It would take new images for the recorded ones, without end."""
+    read = recorded.read_run
+    monkeypatch.setattr(recorded, "read_run", lambda reader: replace(read(reader), source="oak:", image_format="none"))
+    assert main(["replay", str(run), "-o", str(tmp_path / "c")]) == 2
+    assert "its source oak: is a camera" in capsys.readouterr().err
 
 
 def test_a_replay_numbers_the_frames_as_the_run_did(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,8 @@ from stereo_sfm.drivers.rectified import rectified
 from stereo_sfm.drivers.replayed import ReplayedSource
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import Source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import StereoImage
 from tests.drivers.dataset_folders import make_kitti
 
 SPEC = "sim:aisle?camera=pinhole&size=160x100&frames=9&effects=0"
@@ -45,6 +47,21 @@ def test_the_frames_are_those_of_the_iteration(opened: Callable[[Path], Source],
             for image, k in zip(chosen, positions, strict=True):
                 assert image.stamp_ns == images[k].stamp_ns
                 np.testing.assert_array_equal(image.left, images[k].left)
+
+
+def test_a_replay_ends_with_the_last_frame_of_the_run() -> None:
+    """What follows may be what ended the run."""
+
+    class Damaged(MemorySource):
+        def __iter__(self) -> Iterator[StereoImage]:
+            yield from self.images[:5]
+            raise StereoSfmError("damaged")
+
+    with open_source(SPEC) as source:
+        damaged = Damaged(source.rig, list(source))
+    assert [image.frame_id for image in ReplayedSource(damaged, (1, 2, 4))] == [1, 2, 4]
+    with pytest.raises(StereoSfmError, match="damaged"):
+        list(ReplayedSource(damaged, (1, 2, 5)))
 
 
 def test_rectify_renders_no_more_than_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

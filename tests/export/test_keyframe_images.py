@@ -11,14 +11,17 @@ import pytest
 
 from stereo_sfm.calib import save_rig
 from stereo_sfm.cli import main
+from stereo_sfm.config import Config
 from stereo_sfm.drivers.rectified import RectifiedSource, rectified
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.keyframe_images import check_session, open_recording, session_of_recording, write_keyframe_images
+from stereo_sfm.log.run_log import RunLog
+from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.saved_map import SavedMap, joined, save_map
-from stereo_sfm.types import RIG_TERMS, StereoImage
+from stereo_sfm.types import RIG_TERMS, StartCheck, StereoImage
 from tests.maps.maps import small_map
 
 LATER_NS = 10**12
@@ -97,6 +100,23 @@ def test_images_are_those_of_the_maps_camera(how: str, option: str) -> None:
     source = open_recording(SPEC, [MapCamera(rig)])
     assert isinstance(source, RectifiedSource) == (option != "none")
     assert np.array_equal(source.rig.left.params, rig.left.params)
+
+
+def test_images_are_paired_as_in_the_run(tmp_path: Path) -> None:
+    """Its start check found that the right images are a frame late; the log's own images are paired already."""
+    with open_source(SPEC) as source:
+        rig, images = source.rig, list(source)
+    check = StartCheck(0, images[0].stamp_ns, "a frame apart", "corrected for this run", True, "", 1)
+    log = RunLog(LogWriter(tmp_path / "run.mcap"), rig, Config(), source=SPEC, mode="inline", image_format="none")
+    log.put(check)
+    log.close()
+    with open_recording(SPEC, [MapCamera(rig)], run=tmp_path) as shifted:
+        seen = list(shifted)
+    assert len(seen) == len(images) - 1
+    for k, image in enumerate(seen):
+        right = images[k + 1].right
+        assert image.frame_id == k and image.right is not None and right is not None
+        np.testing.assert_array_equal(image.right, right)
 
 
 def test_images_of_another_camera_are_refused(saved: SavedMap) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,19 @@ def test_a_part_by_time_has_its_samples(tmp_path: Path) -> None:
     assert [p.stamp_ns for p in part] == [image.stamp_ns for image in images[10:21]]
     for one, other in zip(images[10:21], part, strict=True):
         assert_same_image(one, other)
+
+
+@pytest.mark.parametrize("late_ns", [-10 * PERIOD_NS, 3600 * 10**9, -START_NS // 2])
+def test_samples_of_another_clock_cost_no_image(late_ns: int, tmp_path: Path) -> None:
+    images = [
+        image if image.imu is None else replace(image, imu=image.imu.shifted(late_ns))
+        for image in stereo_images(40, np.random.default_rng(7))
+    ]
+    assert sum(image.imu is not None for image in images) > 20
+    write_recording(tmp_path / "a.mcap", MemorySource(fisheye_rig(), images))
+    with open_source(tmp_path / "a.mcap") as source:
+        for one, other in zip(images, source, strict=True):
+            assert_same_image(one, other)
 
 
 def test_an_existing_file_is_not_overwritten_by_default(tmp_path: Path) -> None:

@@ -317,6 +317,10 @@ def test_a_recorded_schedule_is_followed() -> None:
     assert dues(Recorded([Applied(1, 12), Applied(2, 15), Applied(3, 15)]), (0, 1, 2), 10) == [2, 5, 5]
 
 
+def test_a_repeat_with_later_keyframes_does_not_wait_for_updates_that_never_come() -> None:
+    assert dues(Recorded([Applied(1, 12), Applied(2, 15), Applied(3, 15)]), (0, 8, 9), 10) == [2, 9]
+
+
 def test_trajectory_of_the_wall_is_right() -> None:
     frames = list(run_inline(SlidingWall(40), CONFIG))
     x = np.array([f.odom_T_cam[0, 3] for f in frames])
