@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Write the images, print the row error."""
     import numpy as np
 
-    from stereo_sfm.calib import load_rig, save_rig
+    from stereo_sfm.calib import save_rig
     from stereo_sfm.calib.drawing import side_by_side
     from stereo_sfm.calib.matches import match_pair
     from stereo_sfm.calib.rectification import rectify
@@ -47,9 +47,8 @@ def run(args: argparse.Namespace) -> int:
     if args.output.exists() and any(args.output.iterdir()) and not args.overwrite:
         raise _error(f"{args.output} is not empty: choose another folder or give --overwrite")
     errors: list[np.ndarray] = []
-    with open_source(args.source) as source:
-        rig = source.rig if args.rig is None else load_rig(args.rig)
-        rectification = rectify(rig, args.projection, args.hfov, parse_size(args.size))
+    with open_source(args.source, args.rig) as source:
+        rectification = rectify(source.rig, args.projection, args.hfov, parse_size(args.size))
         for image in spread(source, args.frames):
             if image.right is None:
                 raise _error(f"frame {image.frame_id} has no right image")

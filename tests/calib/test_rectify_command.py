@@ -16,6 +16,7 @@ from stereo_sfm.drivers.rectified import RectifiedSource, rectified
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from tests.drivers.dataset_folders import make_images
 
 SIM = "sim:aisle?frames=2"
 
@@ -62,6 +63,14 @@ def test_command_writes_images_rig_and_row_error(tmp_path: Path, capsys: pytest.
     assert "not empty" in capsys.readouterr().err
     assert main(["rectify", SIM, "-o", str(tmp_path / "p"), "--size", "640by480"]) == 2
     assert main(["rectify", SIM, "-o", str(tmp_path / "q"), "--rig", "/nonexistent.yaml"]) == 2
+
+
+def test_a_folder_without_a_calibration_of_its_own(tmp_path: Path) -> None:
+    make_images(tmp_path / "data")
+    (tmp_path / "data" / "rig.yaml").rename(tmp_path / "rig.yaml")
+    command = ["rectify", str(tmp_path / "data"), "--rig", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "out")]
+    assert main(command) == 0
+    assert load_rig(tmp_path / "out" / "rig.yaml").left.model == "epipolar"
 
 
 @pytest.mark.parametrize(
