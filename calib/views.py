@@ -85,8 +85,8 @@ def gather(
     for a, b in pairs:
         size = (a.shape[1], a.shape[0])
         da, db = target.detect(a), target.detect(b)
-        seen = da if len(da) else db
-        if not len(seen) or not (every_view or is_new(seen, left, size[0])):
+        seen, before = (da, left) if len(da) else (db, right)
+        if not len(seen) or not (every_view or is_new(seen, before, size[0])):
             continue
         left.append(da)
         right.append(db)

@@ -13,12 +13,13 @@ from stereo_sfm.calib.coverage import coverage, is_new
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.solve import Calibration, align_pairs, calibrate, plane_pose
 from stereo_sfm.calib.targets import Detection, Target, read_target
-from stereo_sfm.calib.views import find_pairs
+from stereo_sfm.calib.views import find_pairs, gather
 from stereo_sfm.cli import main
 from stereo_sfm.drivers.sim.boards import Faults, random_views, render_boards
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.types import U8
 
 CHARUCO = Target("charuco", 8, 8, 0.06, 0.75, "DICT_5X5_100")
 RIGS = {"fisheye": ("kb4", 110.0), "distorted": ("pinhole", 45.0)}
@@ -178,6 +179,21 @@ def test_coverage_names_what_is_missing() -> None:
     assert "tilt" in text and "at least 12" in text
     assert not is_new(one, [one], 640)
     assert is_new(Detection(one.ids, one.uv + 60), [one], 640)
+
+
+class Lit(Target):
+    """Seen in images that are not black."""
+
+    def detect(self, image: U8) -> Detection:
+        ids = np.arange(len(self.points) if image.any() else 0)
+        return Detection(ids, 100.0 + 1000 * self.points[ids, :2])
+
+
+@pytest.mark.parametrize("sides", [(1, 0), (0, 1), (1, 1)])
+def test_a_board_that_stands_still_is_one_view(sides: tuple[int, int]) -> None:
+    left, right = (np.full((48, 64), side, np.uint8) for side in sides)
+    kept = gather(iter([(left, right)] * 5), Lit("checkerboard", 9, 6, 0.02), 60, False, lambda *_: None)[2]
+    assert len(kept) == 1
 
 
 def test_reversed_boards_are_turned_round() -> None:
