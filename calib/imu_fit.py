@@ -23,6 +23,7 @@ MIN_TURN = 0.03  # rad/s, root mean square, below which a rotation shows nothing
 OFFSET_MS, ROTATION_DEG = (0.5, 3.0), (0.1, 1.0)  # standard deviations: known well, known at all
 WRONG_OFFSET_MS, WRONG_ROTATION_DEG = (3.0, 20.0), (1.0, 5.0)  # differences that warn and fail
 GRAVITY_RANGE = 9.3, 10.3  # m/s^2
+MEAN_S = 0.5  # of forces: vibration averages out, and the device hardly tilts
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +37,7 @@ class ImuFit:
     scale: float  # rates of the gyroscope over those of the images
     gyro_bias: F64  # (3,) rad/s, subtracted from corrected samples
     agreement: float  # correlation of the rates, 1 at best
-    gravity: float  # m/s^2, mean force over the recording
+    gravity: float  # m/s^2, of the accelerometer, see `mean_force`
     noise: F64  # (2,) densities while the camera stood, see `noise_at_rest`
 
 
@@ -174,8 +175,22 @@ class _Rates:
 
     @property
     def gravity(self) -> float:
-        """m/s^2, mean force; NaN without samples."""
-        return float(np.linalg.norm(self.force.mean(axis=0))) if len(self.force) else float("nan")
+        """m/s^2, see `mean_force`."""
+        return mean_force(self.force_times, self.force)
+
+
+def mean_force(times: F64, force: F64) -> float:
+    """m/s^2: median size of the means (3,) over `MEAN_S`; NaN without samples. Of a tilting device, a longer mean would
+    be too small.
+
+    Args:
+        times: (L,) seconds, ascending. force: (L, 3) m/s^2.
+    """
+    if not len(force):
+        return float("nan")
+    begins = np.unique((times - times[0]) // MEAN_S, return_index=True)[1]
+    counts = np.diff(begins, append=len(force))
+    return float(np.median(np.linalg.norm(np.add.reduceat(force, begins) / counts[:, None], axis=1)))
 
 
 def _ordered(stamp_ns: I64, values: F64) -> tuple[F64, F64]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.calib import load_rig, save_rig
-from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu, with_imu_terms
+from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, mean_force, precision_imu, with_imu_terms
 from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
 from stereo_sfm.calib.sample_noise import judge_noise, judge_wheel_noise, noise_at_rest, noise_of_speeds
 from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel, precision_wheel
@@ -95,6 +95,18 @@ def test_wrong_units_axes_and_sensors_fail(change: Callable[[ImuSamples], ImuSam
     fit = fit_imu(found.stamp_ns, found.poses, change(found.imu), known)
     failed = {f.name: f.text for f in judge_imu(fit, known) if f.level == 2}
     assert says in failed[name]
+
+
+def test_a_mean_force_of_tilts_and_of_vibration() -> None:
+    """Half a minute of tilts by up to 50 degrees, at 0.3 Hz, and of 20 m/s^2 at 37 Hz."""
+    times = np.arange(0, 30, 0.005)
+    tilt = np.radians(50) * np.sin(2 * np.pi * 0.3 * times)
+    force = 9.81 * np.stack([np.sin(tilt), np.cos(tilt), np.zeros(len(times))], axis=1)
+    assert np.linalg.norm(force.mean(axis=0)) < 9.0
+    shaken = force + 20 * np.sin(2 * np.pi * 37 * times)[:, None]
+    for samples in (force, shaken, shaken[:-17]):
+        assert mean_force(times[: len(samples)], samples) == pytest.approx(9.81, abs=0.3)
+    assert np.isnan(mean_force(times[:0], force[:0]))
 
 
 def test_samples_with_gaps_doubles_and_nan_are_used_as_far_as_they_go() -> None:
