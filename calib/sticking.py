@@ -52,18 +52,19 @@ def positions(count: int | None) -> list[int]:
     return sorted({round(last * (k / (IMAGES - 1)) ** 1.5) for k in range(IMAGES)})
 
 
-def sticking(images: Iterable[StereoImage]) -> list[Bool]:
+def sticking(images: Iterable[StereoImage], masks: Sequence[Bool | None] = (None, None)) -> list[Bool]:
     """(H, W) of each camera, True where something sticks to the image; empty if nothing does, or they cannot tell.
 
     Args:
         images: of the same cameras, in order; no more are read than needed.
+        masks: (H, W) of the cameras, True where an image is used; elsewhere nothing counts.
     """
     cameras: list[_Camera] = []
     begin_ns = end_ns = None
     for image in images:
         begin_ns, end_ns = image.stamp_ns if begin_ns is None else begin_ns, image.stamp_ns
         views = [image.left] if image.right is None else [image.left, image.right]
-        cameras = cameras or [_Camera() for _ in views]
+        cameras = cameras or [_Camera(mask) for _, mask in zip(views, masks, strict=False)]
         for camera, view in zip(cameras, views, strict=False):
             camera.add(view)
             if camera.rests:
@@ -90,7 +91,7 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
     if side:
         other = "right" if side == "left" else "left"
         return StartFinding(f"the {side} camera repeats one image while the {other} one moves: check it", shown=True)
-    parts = sticking(images)
+    parts = sticking(images, (rig.left_mask, rig.right_mask))
     if not parts:
         return finding
     shares = [
@@ -158,8 +159,8 @@ class _View:
 class _Camera:
     """What all counted pairs of one camera's images have in common."""
 
-    def __init__(self) -> None:
-        self._seen: list[_View] = []
+    def __init__(self, mask: Bool | None) -> None:
+        self._mask, self._seen = mask, list[_View]()
         self._votes: FixedVotes | None = None
 
     def add(self, image: U8) -> None:
@@ -193,11 +194,12 @@ class _Camera:
         return self._votes is not None and self._votes.pairs > MOVING * pairs
 
     def part(self, min_votes: int = MIN_VOTES) -> Bool:
-        """(H, W) what the windows that stay cover, off the rim of what is dark, such as a fisheye's: no corners lie
-        there; nothing if it is too small."""
+        """(H, W) what the windows that stay cover, off the rim of what is masked, or dark, such as a fisheye's: no
+        corners lie there; nothing if it is too small."""
         assert self._votes is not None
         brightest = np.maximum.reduce([one.moments.mean for one in self._seen])
-        lit = uncovered(brightest > DARK * np.median(brightest), WINDOW)
+        lit = brightest > DARK * np.median(brightest)
+        lit = uncovered(lit if self._mask is None else lit & self._mask, WINDOW)
         windows = _parts(self._votes.fixed(min_votes), lit, self._votes)
         return ~uncovered(~windows, WINDOW // 2) if windows.mean() > LEAST else np.zeros_like(windows)
 

@@ -68,6 +68,18 @@ def test_what_sticks_to_the_image_is_masked(images: list[s.StereoImage], change:
     assert left[edges > 0].mean() > 0.15 and left.mean() < 15 * changed.mean()
 
 
+def test_what_is_masked_already_does_not_count(images: list[s.StereoImage]) -> None:
+    """Masked as far as the robot reaches, and no further; and all but a part of it."""
+    stuck = [replace(image, left=robot(image.left)) for image in images]
+    rows, columns = images[0].left.shape
+    mask = np.ones((rows, columns), bool)
+    mask[int(0.85 * rows) :, int(0.2 * columns) : int(0.8 * columns)] = False
+    assert sticking(stuck, (mask, None)) == []
+    mask[:, int(0.6 * columns) :] = True
+    left, right = sticking(stuck, (mask, None))
+    assert left.any() and not left[:, : int(0.6 * columns)].any() and not right.any()
+
+
 def test_an_image_without_light_hides_nothing(images: list[s.StereoImage]) -> None:
     """While the lamps are off, all that is seen sticks."""
     stuck = [replace(image, left=text(image.left // 30 if k == 4 else image.left)) for k, image in enumerate(images)]
@@ -80,10 +92,12 @@ def test_a_run_has_the_mask_and_says_so(data_root: Path) -> None:
     for count, line in ((300, "'stereo-sfm mask"), (40_000, "turn the projector off")):
         stuck = [replace(image, left=dots(image.left, count)) for image in good]
         with StartCheckedSource(MemorySource(rig, stuck), correct=True) as checked:
-            found, mask = checked.start_check, checked.rig.left_mask
+            found, masked, mask = checked.start_check, checked.rig, checked.rig.left_mask
         assert found is not None and found.shown and line in found.line
         assert "% of the left image sticks to the image" in found.line and "right image" not in found.line
         assert (mask is not None and 0.7 < mask.mean() < 0.99) if count == 300 else not found.rig  # exit code 4
+        with StartCheckedSource(MemorySource(masked, stuck), correct=True) as checked:
+            assert (checked.start_check is None) == (count == 300)  # with that mask nothing is left to say
 
 
 def passed(image: U8, k: int) -> U8:
