@@ -49,6 +49,7 @@ class StartCheckedSource(WrappedSource):
         self._paired = paired
         self._correct, self._check = correct, known
         self._looked_at = known is not None
+        self.contradicted = False  # the calibration, by the first images; not by what sticks to them alone
         self._images: Iterator[StereoImage] | None = None  # a begun iteration, from the first image on
         self._original: Rig | None = None
         self._rig: Rig | None = None
@@ -90,7 +91,9 @@ class StartCheckedSource(WrappedSource):
 
         self._looked_at = True
         first = _FirstImages(iter(self.source))
-        finding = self._with_sticking(check_start(self.source.rig, first.looked_at(), self.source.other_reading))
+        finding = check_start(self.source.rig, first.looked_at(), self.source.other_reading)
+        self.contradicted = bool(finding.text)
+        finding = self._with_sticking(finding)
         if finding.text and first.seen:
             self._check = self._report(finding, first.seen[0])
         self._images = first.passed_on()

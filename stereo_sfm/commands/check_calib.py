@@ -83,7 +83,8 @@ def run(args: argparse.Namespace) -> int:
         rectification = rectify(rig, "epipolar")
         images = itertools.islice(source, options.max_frames)
         start = source.start_check
-        widely = search_rows(rectification) if start is not None and start.rig else DEFAULT_SEARCH
+        corrected = start is not None and start.rig and source.contradicted
+        widely = search_rows(rectification) if corrected else DEFAULT_SEARCH
         total = min(source.frame_count or options.max_frames, options.max_frames)
         gap = 0 if source.live else max(0, total // options.windows - MAX_FRAMES)
         corners = corners_for(total, options.windows)
@@ -95,7 +96,8 @@ def run(args: argparse.Namespace) -> int:
         readout = shutter.measured
         mistake = "" if start is None or start.rig else start.text
         report = _checked(lambda: check(rig, rectification, windows, rolling=readout.best_s != 0), mistake)
-        others = [] if start is None else [Finding(MISTAKE if mistake else "first images", 2, start.text)]
+        level = 2 if mistake or source.contradicted else 1  # a warning of what sticks, and can be masked
+        others = [] if start is None else [Finding(MISTAKE if mistake else "first images", level, start.text)]
         others += [
             _shutter(rig.shutter, readout, errors_px),
             *_robot(masks, rig),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from stereo_sfm.calib import load_rig, save_rig
+from stereo_sfm.calib import load_rig, save_rig, start, sticking
 from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
 from stereo_sfm.calib.check import CheckReport, Finding, check
 from stereo_sfm.calib.choice import choose
@@ -19,6 +20,7 @@ from stereo_sfm.calib.matches import Matches
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import DIRECTION, SKEW
+from stereo_sfm.calib.start import StartFinding
 from stereo_sfm.calib.tracks import MAX_FRAMES, Window, collect, corners_for
 from stereo_sfm.cli import main
 from stereo_sfm.demo import demo_recording
@@ -66,6 +68,7 @@ def windows(rig: Rig, skew_s: float = 0.0, motion: float = 1.0, count: int = 2) 
     return out
 
 
+FEW = "sim:aisle?frames=3&camera=distorted&size=480x300"
 RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
 SEEN = {name: windows(rig) for name, rig in RIGS.items()}
 
@@ -155,7 +158,7 @@ def test_real_recordings(data_root: Path, folder: str) -> None:
 
 
 def test_command_verdict_exit_code_and_correction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = "sim:aisle?frames=3&camera=distorted&size=480x300"
+    source = FEW
     assert main(["check-calib", source]) == 0
     text = capsys.readouterr().out
     assert "verdict: PASS" in text and "row error by image region" in text
@@ -171,6 +174,36 @@ def test_command_verdict_exit_code_and_correction(tmp_path: Path, capsys: pytest
     assert findings["focal length, both cameras"]["judged"] is False  # three frames
     assert findings["focal length, both cameras"]["verdict"] is None
     assert load_rig(mended).baseline == pytest.approx(0.075, rel=0.01)
+
+
+def saying(finding: StartFinding) -> Callable[[Rig, Iterator[StereoImage], object], StartFinding]:
+    """A start check that finds this in the first image."""
+
+    def check_start(_rig: Rig, images: Iterator[StereoImage], _other: object) -> StartFinding:
+        next(images)
+        return finding
+
+    return check_start
+
+
+def in_first_images(capsys: pytest.CaptureFixture[str], command: list[str]) -> tuple[int, str]:
+    """Exit code of a command, and its verdict on the first images."""
+    code = main([*command, "--json"])
+    findings = json.loads(capsys.readouterr().out)["findings"]
+    return code, next(f["verdict"] for f in findings if f["name"] == "first images")
+
+
+def test_what_sticks_to_the_images_is_no_wrong_calibration(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def found(finding: StartFinding, rig: Rig, _: object) -> StartFinding:
+        mask = np.ones((rig.left.height, rig.left.width), bool)
+        return replace(finding, text="dirt", shown=True, masked=replace(rig, left_mask=mask))
+
+    monkeypatch.setattr(sticking, "with_sticking", found)
+    assert in_first_images(capsys, ["check-calib", FEW]) == (0, "WARN")
+    monkeypatch.setattr(start, "check_start", saying(StartFinding("swapped", shown=True)))
+    assert in_first_images(capsys, ["check-calib", FEW]) == (3, "FAIL")
 
 
 def test_swapped_cameras_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
