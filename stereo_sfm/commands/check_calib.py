@@ -81,6 +81,7 @@ def run(args: argparse.Namespace) -> int:
     with StartCheckedSource(open_source(options.source, options.rig), correct=True) as source:
         rig = source.given_rig
         rectification = rectify(rig, "epipolar")
+        source.look()  # at a live camera's images, too: the given calibration is checked, whatever they say
         images = itertools.islice(source, options.max_frames)
         start = source.start_check
         corrected = start is not None and start.rig and source.contradicted

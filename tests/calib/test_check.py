@@ -206,6 +206,15 @@ def test_what_sticks_to_the_images_is_no_wrong_calibration(
     assert in_first_images(capsys, ["check-calib", FEW]) == (3, "FAIL")
 
 
+def test_a_live_cameras_wrong_calibration_is_checked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with open_source(FEW) as opened:
+        other = turned(opened.rig, (1.5, 0, 0))
+    monkeypatch.setattr(start, "check_start", saying(StartFinding("turned", other, shown=True)))
+    assert in_first_images(capsys, ["check-calib", f"{FEW}&realtime=true", "--search", "14"]) == (3, "FAIL")
+
+
 def test_swapped_cameras_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("left", "right"):
         (tmp_path / name).mkdir()
