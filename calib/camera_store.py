@@ -38,7 +38,7 @@ class CameraStore:
             return rig
         stored = read_native(path)
         log.info("the calibration of camera %s is the corrected one of %s", rig.serial, path)
-        return replace(rig, right=stored.right, left_T_right=stored.left_T_right)
+        return _with_right(rig, stored)
 
     def original(self, start: Rig) -> Rig:
         """The calibration that the rig of a run's start corrects; the rig itself if it is not the stored one.
@@ -95,9 +95,9 @@ class CorrectionKeeper:
         """
         self._store = None if store is None else CameraStore(store)
         self._start = start
-        given = start if given is None else given
-        self._original = given if self._store is None else self._store.original(given)
-        self._checked = given is not start  # and corrected
+        self._given = start if given is None else given
+        self._original = self._given if self._store is None else self._store.original(self._given)
+        self._checked = rig_to_text(_with_right(self._given, start)) != rig_to_text(self._given)  # and corrected
 
     def keep(self, correction: CalibrationUpdate) -> None:
         """Keep a correction that was applied, in place of the run's earlier one; a warning if that is not possible."""
@@ -114,9 +114,14 @@ class CorrectionKeeper:
     def _keep(self, rig: Rig) -> None:
         if self._store is not None:
             try:
-                self._store.keep(self._original, rig)
+                self._store.keep(self._original, _with_right(self._given, rig))
             except StereoSfmError as error:
                 log.warning("%s", error)
+
+
+def _with_right(rig: Rig, corrected: Rig) -> Rig:
+    """The rig with another one's right camera: what is kept."""
+    return replace(rig, right=corrected.right, left_T_right=corrected.left_T_right)
 
 
 def _write(rig: Rig, path: Path) -> None:

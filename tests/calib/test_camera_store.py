@@ -54,6 +54,19 @@ def test_the_next_run_starts_with_the_correction(rig: Rig, tmp_path: Path) -> No
     ]  # fmt: skip
 
 
+def test_what_the_start_check_changed_besides_is_not_kept(rig: Rig, tmp_path: Path) -> None:
+    """Masks, and another left lens: with them, the file would be of another calibration."""
+    mask = np.ones((rig.left.height, rig.left.width), bool)
+    left = replace(rig.left, fx=1.01 * rig.left.fx)
+    CorrectionKeeper(tmp_path, replace(rig, left_mask=mask), rig).keep_last([])
+    assert list(tmp_path.iterdir()) == []
+    for _ in range(3):
+        given = CameraStore(tmp_path).corrected(rig)
+        CorrectionKeeper(tmp_path, replace(given, left=left, left_mask=mask), given).keep_last([applied(0.1 * TERMS)])
+    thrice = with_terms(with_terms(with_terms(rig, 0.1 * TERMS), 0.1 * TERMS), 0.1 * TERMS)
+    assert rig_to_text(CameraStore(tmp_path).corrected(rig)) == rig_to_text(thrice)
+
+
 def test_what_is_only_reported_or_has_no_store_is_not_kept(rig: Rig, tmp_path: Path) -> None:
     CorrectionKeeper(tmp_path, rig).keep(replace(applied(TERMS), applied=False))
     CorrectionKeeper(None, rig).keep(applied(TERMS))
