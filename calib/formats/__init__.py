@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -75,22 +75,30 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
     path = Path(path).expanduser()
     name = format or {".json": "foxglove", ".xml": "opencv"}.get(path.suffix, "rig")
     write = _function(name, 2)
-    if rig.readout_s and name != "rig":
-        log.warning(
-            "%s cannot store the readout time of a rolling shutter (%g s), it is lost: the format 'rig' keeps it",
-            name,
-            rig.readout_s,
-        )
-    if rig.imu is not None and name not in WITH_IMU:
-        log.warning("%s cannot store an IMU, its calibration is lost: the format 'rig' keeps it", name)
-    if rig.wheel is not None and name != "rig":
-        log.warning("%s cannot store wheel odometry, its calibration is lost: the format 'rig' keeps it", name)
+    for what in _lost(rig, name):
+        log.warning("%s cannot store %s lost: the format 'rig' keeps it", name, what)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         refuse_pipe(path)
         write(rig, path)
     except OSError as error:
         raise StereoSfmError(f"cannot write the calibration to {path}: {error.strerror}") from None
+
+
+def _lost(rig: Rig, name: str) -> Iterator[str]:
+    """What a format does not store of a rig."""
+    if rig.imu is not None and name not in WITH_IMU:
+        yield "an IMU, its calibration is"
+    if name == "rig":
+        return
+    if rig.readout_s:
+        yield f"the readout time of a rolling shutter ({rig.readout_s:g} s), it is"
+    if rig.wheel is not None:
+        yield "wheel odometry, its calibration is"
+    if rig.left_mask is not None or rig.right_mask is not None:
+        yield "what is masked, it is"
+    if rig.depth:
+        yield "that the right camera is virtual (RGB-D), it is"
 
 
 def recognise(path: Path) -> str:

@@ -143,6 +143,19 @@ def test_a_readout_that_a_dialect_cannot_state(tmp_path: Path, caplog: pytest.Lo
     assert load_rig(tmp_path / "rig.yaml").readout_s == 0.0
 
 
+def test_masks_and_depth_that_a_format_cannot_state(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    mask = np.ones((RADTAN.left.height, RADTAN.left.width), bool)
+    masked = replace(RADTAN, right_mask=mask)
+    virtual = replace(RADTAN, right=RADTAN.left, depth=True)
+    for rig in (masked, virtual):
+        save_rig(rig, tmp_path / "rig.yaml")
+    assert not caplog.records
+    save_rig(masked, tmp_path / "camchain.yaml", "kalibr")
+    assert "kalibr cannot store what is masked" in caplog.text and "virtual" not in caplog.text
+    save_rig(virtual, tmp_path / "stereo.yml", "opencv")
+    assert "opencv cannot store that the right camera is virtual" in caplog.text
+
+
 def test_a_readout_in_milliseconds_is_rejected() -> None:
     with pytest.raises(StereoSfmError, match="readout of 28 s; give the seconds"):
         Rig(FISHEYE.left, readout_s=28.0)
