@@ -34,6 +34,7 @@ FITTING_SHARE = 0.5  # of the matches
 DOUBTFUL = 0.1  # of the corrected matches, behind the cameras: a mistake may explain more
 CALIBRATE = "'stereo-sfm calibrate' measures lenses; 'stereo-sfm convert-calib --lens' says what a file's numbers are"
 ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images; then use '--rig rig.yaml'"
+PAIR = "pair the images by the cameras' own stamps, or give both of a pair the same number"
 READ_OTHERWISE = "name their topics so ('image_rect' or 'image_raw'), or give their calibration with '--rig FILE'"
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
@@ -91,7 +92,9 @@ def check_start(
     tried = None if better is None else _confirmed(better, seen, chosen)
     if better is not None and tried is not None:
         text, shown = mistake(rig, pairs, better.rig) if tried.behind > DOUBTFUL and not better.shift else ("", False)
-        return StartFinding(text, shown=True) if shown else StartFinding(better.text, better.rig, better.shift, True)
+        if shown:
+            return StartFinding(text, shown=True)
+        return StartFinding(better.text, better.rig, better.shift, True, PAIR if better.shift else ADVICE)
     if lens is not None:
         return _of_lens(lens)
     if cameras.rows_fit:
@@ -102,7 +105,7 @@ def check_start(
 
 def _of_lens(lens: OtherLens) -> StartFinding:
     text = lens.text if lens.known else f"{lens.text}: {CALIBRATE}"
-    return StartFinding(text, lens.rig if lens.known else None, shown=True)
+    return StartFinding(text, lens.rig if lens.known else None, shown=True, advice=CALIBRATE)
 
 
 def _confirmed(better: Fit, images: Sequence[StereoImage], chosen: Sequence[int]) -> _Cameras | None:

@@ -156,7 +156,7 @@ ERRORS = {"x": {"x_deg": 2.0}, "z": {"z_deg": -2.0}, "both": {"x_deg": -1.0, "z_
 def test_a_large_error_is_found_and_corrected(pair: tuple[s.Rig, list[s.StereoImage]], name: str) -> None:
     rig, images = pair
     found = check_start(wrong(rig, **ERRORS[name]), images)
-    assert found.rig is not None and found.shown and found.shift == 0
+    assert found.rig is not None and found.shown and found.shift == 0 and "check-calib" in found.advice
     away = se3.inverse(rig.left_T_right) @ found.rig.left_T_right
     rows = 0.0 if found.rig.right is None or rig.right is None else found.rig.right.cy - rig.right.cy
     about_x = np.rad2deg(se3.log(away)[3] + rows / rig.left.fy)  # rows and a turn are alike in a narrow lens
@@ -201,6 +201,7 @@ def test_images_paired_frames_apart_are_found(data_root: Path, name: str, shift:
     apart = [replace(images[k], right=images[k - shift].right) for k in range(2, 15)]
     found = check_start(rig, apart)
     assert found.shift == shift and found.rig is rig
+    assert "stamps" in found.advice and "check-calib" not in found.advice  # which writes no shift
     assert check_start(wrong(rig, x_deg=1.0), apart).shift == shift
 
 
@@ -230,6 +231,7 @@ def test_a_lens_under_the_name_of_another_model(
     assert found.shown and f"contradict the lens model {wrong_model.model}" in found.text
     assert found.rig is not None and found.rig.right is not None
     assert (found.rig.left.model, found.rig.right.model) == (rig.left.model, rig.right.model)
+    assert "stereo-sfm calibrate" in found.advice and "check-calib" not in found.advice  # which writes no lens model
     assert check_start(found.rig, images).text == ""
 
 
