@@ -131,19 +131,21 @@ def _merge(options: MergeOptions) -> int:
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.maps.merge import merge, share_a_session
     from stereo_sfm.maps.saved_map import load_map, save_map
+    from stereo_sfm.maps.store import lock_versioned
 
     if len(options.maps) < 2:
         raise StereoSfmError("merge takes at least two maps")
     _check_free(options.output, options.overwrite)
     config = configuration.load(None, options.set)
-    maps = [load_map(folder) for folder in options.maps]
-    for (name_a, a), (name_b, b) in combinations(zip(options.maps, maps, strict=True), 2):
-        if share_a_session(a, b):
-            raise StereoSfmError(
-                f"{name_a} and {name_b} contain the same session: merge takes maps of different sessions"
-            )
-    result = merge(maps, _vocabulary(maps[0], config.loop.vocabulary), config.loop, config.mapper)
-    save_map(result.saved, options.output)
+    with lock_versioned(options.output):
+        maps = [load_map(folder) for folder in options.maps]
+        for (name_a, a), (name_b, b) in combinations(zip(options.maps, maps, strict=True), 2):
+            if share_a_session(a, b):
+                raise StereoSfmError(
+                    f"{name_a} and {name_b} contain the same session: merge takes maps of different sessions"
+                )
+        result = merge(maps, _vocabulary(maps[0], config.loop.vocabulary), config.loop, config.mapper)
+        save_map(result.saved, options.output)
     print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen in more than one session")
     print("\n".join(describe(result.saved)))
     return 0
@@ -159,11 +161,13 @@ def _vocabulary(saved: SavedMap, named: str) -> Vocabulary:
 def _prune(options: PruneOptions) -> int:
     from stereo_sfm.maps.merge import prune
     from stereo_sfm.maps.saved_map import load_map, save_map
+    from stereo_sfm.maps.store import lock_versioned
 
     _check_free(options.output, options.overwrite)
-    saved = load_map(options.map)
-    pruned = prune(saved, options.min_views, options.min_seen_share, options.unseen_sessions)
-    save_map(pruned, options.output)
+    with lock_versioned(options.output):
+        saved = load_map(options.map)
+        pruned = prune(saved, options.min_views, options.min_seen_share, options.unseen_sessions)
+        save_map(pruned, options.output)
     before, after = saved.snapshot, pruned.snapshot
     counts = f"{len(before.pt_ids)} -> {len(after.pt_ids)} points, {len(saved)} -> {len(pruned)} keyframes"
     print(f"{counts}: {options.output}")

@@ -119,7 +119,7 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
 
     Raises:
         StereoSfmError: it cannot be merged, or another process writes to the map, and the session's own map was written
-            instead (next to `map_out` where that is the map to merge with).
+            instead (next to `map_out` where that must stay as it is).
         OSError: the map cannot be written.
     """
     from stereo_sfm.maps.merge import merge
@@ -135,16 +135,20 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
             log.warning("nothing was mapped: no map is written to %s", out)
         return
     with contextlib.ExitStack() as held:
-        if folders.map_in is not None and out is not None:
+        if out is not None:
+            stays = True  # what is in `out`
             try:
                 held.enter_context(lock_versioned(out))
-                both, vocabulary = [load_map(folders.map_in), saved], configured_vocabulary(config.loop)
-                saved = merge(both, vocabulary, config.loop, config.mapper, mapper.place()).saved
+                stays = folders.map_in is not None and out.resolve() == folders.map_in.resolve()
+                if folders.map_in is not None:
+                    both, vocabulary = [load_map(folders.map_in), saved], configured_vocabulary(config.loop)
+                    saved = merge(both, vocabulary, config.loop, config.mapper, mapper.place()).saved
             except StereoSfmError as error:
-                if out.resolve() == folders.map_in.resolve():  # an unused name next to it
+                if stays:  # an unused name next to it
                     names = (out.parent / f"{out.name}_walk{k}" for k in itertools.count(1))
                     out = next(name for name in names if not name.exists())
-                failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
+                what = f"merged with {folders.map_in}" if folders.map_in else f"saved to {folders.map_out}"
+                failure = f"not {what}: {error}; {out} contains this session alone"
         for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
             save_map(saved, folder)
     if failure:

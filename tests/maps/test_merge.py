@@ -252,10 +252,12 @@ def test_a_failed_merge_keeps_the_maps(
     )
 
 
+@pytest.mark.parametrize("map_in", ["store", "other", None])
 def test_a_session_is_not_merged_into_a_store_that_another_process_writes(
-    tmp_path: Path, drives: list[StoreSequence], maps: list[SavedMap]
+    tmp_path: Path, drives: list[StoreSequence], maps: list[SavedMap], map_in: str | None
 ) -> None:
-    save_map(maps[0], tmp_path / "store")
+    for name in ("store", "other"):
+        save_map(maps[0], tmp_path / name)
     mapper = Mapper(MapperConfig(), drives[1].rig)
     for k, keyframe in enumerate(drives[1].keyframes[:5]):
         mapper.step(dataclasses.replace(keyframe, kf_id=k))
@@ -263,6 +265,22 @@ def test_a_session_is_not_merged_into_a_store_that_another_process_writes(
         lock(tmp_path / "store"),
         pytest.raises(StereoSfmError, match=r"another run is writing to .* contains this session alone"),
     ):
-        save_result(mapper, Config(), MapFolders(tmp_path / "store", map_out=tmp_path / "store"))
+        save_result(mapper, Config(), MapFolders(map_in and tmp_path / map_in, map_out=tmp_path / "store"))
     assert len(load_map(tmp_path / "store", drives[0].rig)) == len(maps[0])
     assert len(load_map(tmp_path / "store_walk1", drives[0].rig)) == len(mapper.map.living_keyframes())
+
+
+def test_a_store_that_another_process_writes_is_not_replaced(
+    tmp_path: Path, maps: list[SavedMap], capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(maps[0], tmp_path / "store")
+    save_map(maps[1], tmp_path / "other")
+    store, other = str(tmp_path / "store"), str(tmp_path / "other")
+    before = (tmp_path / "store" / "map.json").read_bytes()
+    with lock(tmp_path / "store"):
+        for command in (["prune", store, "--min-views", "3"], ["merge", store, other]):
+            assert main(["map", *command, "-o", store, "--overwrite"]) == 2
+            assert "another run is writing to" in capsys.readouterr().err
+    assert (tmp_path / "store" / "map.json").read_bytes() == before
+    assert main(["map", "prune", store, "--min-views", "3", "-o", store, "--overwrite"]) == 0
+    assert (tmp_path / "store" / "map.json").read_bytes() != before
