@@ -68,6 +68,9 @@ class AnyMapper(ABC):
         """Search the whole saved map with the next keyframe, where that is what this mapper does."""
         return
 
-    def place(self) -> LoopResult | None:
-        """Where the map that was made lies in the saved map that the run began with; None: nowhere."""
+    def place(self, of: MapSnapshot | None = None) -> LoopResult | None:
+        """Where the map that was made lies in the saved map that the run began with; None: nowhere.
+
+        Args: of, that map as it is read again; with other ids it was changed meanwhile, and there is no place in it.
+        """
         return None

@@ -13,6 +13,7 @@ from stereo_sfm.calibration.sensor_calibration import SensorCalibration
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.localizer import Localizer
 from stereo_sfm.maps.relocalization import Location
 from stereo_sfm.timing import NoSpans
@@ -67,15 +68,15 @@ class Extension(Mapper):
         self._follow_found()
         return None if update is None else self._in_saved_map(update)
 
-    def place(self) -> LoopResult | None:
+    def place(self, of: MapSnapshot | None = None) -> LoopResult | None:
         """The relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.
 
         Ids are those of the respective map.
         """
-        if self._found is None:
+        saved = self._localizer.saved
+        if self._found is None or (of is not None and not _same_ids(saved, of)):
             return None
         where, (living, living_T_kf) = self._found, self._found_kf
-        saved = self._localizer.saved
         candidate = saved.map_T_kf[int(np.searchsorted(saved.kf_ids, where.kf_id))]
         return LoopResult(
             kf_id=living,
@@ -118,3 +119,8 @@ class Extension(Mapper):
             map_T_odom=saved_T_session @ update.map_T_odom,
             down=saved_T_session[:3, :3] @ update.down,
         )
+
+
+def _same_ids(a: MapSnapshot, b: MapSnapshot) -> bool:
+    """Whether an id names the same keyframe or point in both."""
+    return np.array_equal(a.kf_ids, b.kf_ids) and np.array_equal(a.pt_ids, b.pt_ids)

@@ -142,7 +142,8 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
                 stays = folders.map_in is not None and out.resolve() == folders.map_in.resolve()
                 if folders.map_in is not None:
                     both, vocabulary = [load_map(folders.map_in), saved], configured_vocabulary(config.loop)
-                    saved = merge(both, vocabulary, config.loop, config.mapper, mapper.place()).saved
+                    place = mapper.place(both[0].snapshot)
+                    saved = merge(both, vocabulary, config.loop, config.mapper, place).saved
             except StereoSfmError as error:
                 if stays:  # an unused name next to it
                     names = (out.parent / f"{out.name}_walk{k}" for k in itertools.count(1))

@@ -15,6 +15,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.folders import MapFolders, save_result
 from stereo_sfm.maps.joining import Joining
@@ -268,6 +269,30 @@ def test_a_session_is_not_merged_into_a_store_that_another_process_writes(
         save_result(mapper, Config(), MapFolders(map_in and tmp_path / map_in, map_out=tmp_path / "store"))
     assert len(load_map(tmp_path / "store", drives[0].rig)) == len(maps[0])
     assert len(load_map(tmp_path / "store_walk1", drives[0].rig)) == len(mapper.map.living_keyframes())
+
+
+class Placed(Mapper):
+    """Remembers which map it was asked for a place in."""
+
+    asked: MapSnapshot | None = None
+
+    def place(self, of: MapSnapshot | None = None) -> LoopResult | None:
+        self.asked = of
+        return None
+
+
+def test_a_session_is_placed_in_the_map_that_it_is_merged_with(
+    tmp_path: Path, drives: list[StoreSequence], maps: list[SavedMap]
+) -> None:
+    """Ids of the map that the run began with may name other points of one that was changed meanwhile."""
+    save_map(maps[0], tmp_path / "store")
+    mapper = Placed(MapperConfig(), drives[1].rig)
+    for k, keyframe in enumerate(drives[1].keyframes[:5]):
+        mapper.step(dataclasses.replace(keyframe, kf_id=k))
+    config = Config(loop=LoopConfig(min_inliers=10**6))
+    with pytest.raises(StereoSfmError, match="contains this session alone"):
+        save_result(mapper, config, MapFolders(tmp_path / "store", map_out=tmp_path / "other"))
+    assert mapper.asked is not None and same(mapper.asked, load_map(tmp_path / "store").snapshot)
 
 
 def test_a_store_that_another_process_writes_is_not_replaced(

@@ -305,6 +305,10 @@ def test_a_session_continues_in_the_frame_of_the_saved_map(
     for k, pose in zip(rows, poses.all().values(), strict=True):  # those from before it was found too
         assert np.linalg.norm((se3.inverse(true_pose(sequence, k)) @ pose)[:3, 3]) < 0.1
     assert np.linalg.norm((se3.inverse(poses.all()[9]) @ last @ keyframes[9].odom_T_cam)[:3, 3]) < 0.05
+    saved = localizer.saved
+    assert extension.place(saved) is not None
+    for name in ("kf_ids", "pt_ids"):  # of a map that was changed meanwhile
+        assert extension.place(dataclasses.replace(saved, **{name: getattr(saved, name)[1:]})) is None
 
 
 def test_answers_do_not_depend_on_clouds_of_earlier_questions(
