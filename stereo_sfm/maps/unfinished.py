@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import shutil
@@ -18,7 +19,7 @@ from stereo_sfm.input_file import read_bytes
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.header import read_header
 from stereo_sfm.maps.replace_folder import COMPLETE, content, replaced_folder
-from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
+from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
 from stereo_sfm.maps.update import update
 from stereo_sfm.types import LoopResult
 
@@ -87,7 +88,7 @@ def publish(base: Path | None, session: Path, out: Path, config: Config) -> int:
 
 
 def copy_map(folder: Path, to: Path) -> None:
-    """A copy of a map folder that later saves of it do not change; it shares its files where the disk can do that.
+    """A copy of a map folder that does not change with it; it shares what saves replace where the disk can do that.
 
     Raises:
         StereoSfmError: no map, or one that is being replaced all the time.
@@ -105,9 +106,10 @@ def _copy(folder: Path, to: Path) -> None:
     before = content(folder)
     with replaced_folder(to, frozenset(before)) as draft:
         for name in before.keys() - {PLACE, COMPLETE}:
-            try:
-                os.link(folder / name, draft / name)
-            except OSError:
-                shutil.copy2(folder / name, draft / name)
+            if name in map_files():  # others, such as a plan, are written in place
+                with contextlib.suppress(OSError):
+                    os.link(folder / name, draft / name)
+                    continue
+            shutil.copy2(folder / name, draft / name)
         if not before or COMPLETE in before or content(folder) != before:
             raise FileNotFoundError(folder)

@@ -112,9 +112,12 @@ def test_a_copy_has_the_files_of_one_save(
         link(here, there)
 
     monkeypatch.setattr(os, "link", busy)
+    monkeypatch.setattr(unfinished, "map_files", lambda: frozenset("abc"))
     copy_map(folder, tmp_path / "copy")
     assert len(saves) == 9 and texts(tmp_path / "copy") == dict.fromkeys("abc", "9") | foreign
     save(folder, "later")
+    for name in foreign:  # written in place, as a plan is
+        (folder / name).write_text("later")
     assert texts(tmp_path / "copy") == dict.fromkeys("abc", "9") | foreign
 
 
