@@ -152,7 +152,8 @@ def write_version(
             about = About(0, find_floor(saved.snapshot))
         lines = "".join(f"{line}\n" for line in changes)
         save_map(saved, store, _extras(store) | {ABOUT: _about_text(about), CHANGES: lines.encode()}, compress)
-        for number in versions(store)[: -keep or None]:
+        # Those of a store that was here before this one, which count no more, have higher numbers and go first.
+        for number in sorted(versions(store), key=lambda n: (n < about.version, n))[: -keep or None]:
             shutil.rmtree(versions_folder(store) / f"{number:05d}")
         return about.version
 

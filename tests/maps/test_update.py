@@ -18,7 +18,7 @@ from stereo_sfm.maps.changes import changed_cells, describe_changes
 from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
-from stereo_sfm.maps.store import load_current, lock, read_about, versions, write_version
+from stereo_sfm.maps.store import load_current, lock, read_about, undo, versions, versions_folder, write_version
 from stereo_sfm.maps.unfinished import publish, save_session
 from stereo_sfm.maps.update import KEPT_SESSIONS, Update, update
 from stereo_sfm.types import F64, U8, Keyframe
@@ -211,6 +211,17 @@ def test_versions_undo_labels_and_what_people_put_beside(tmp_path: Path, capsys:
     assert main(["map", "undo", str(store)]) == 2  # version 1 was not kept
     assert main(["map", "label", str(store), "aisle 4", "--remove"]) == 0
     assert not read_about(store).aisles
+
+
+def test_a_store_begun_again_keeps_its_own_versions(tmp_path: Path) -> None:
+    """And those of the one that was there before go first."""
+    store, saved = tmp_path / "store", small_map()[1]
+    for number in (4, 6):
+        save_map(saved, versions_folder(store) / f"{number:05d}")
+    for k, kept in enumerate(([4, 6], [0, 6], [0, 1])):
+        assert write_version(store, saved, [], keep=2) == k and versions(store) == kept
+    with lock(store):
+        assert [undo(store), undo(store)] == [1, 0]
 
 
 def _as_saved(saved: SavedMap, folder: Path) -> SavedMap:
