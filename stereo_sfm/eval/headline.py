@@ -18,7 +18,8 @@ def headline(stats: dict[str, Any], evaluations: dict[str, Evaluation], warnings
     if failed:
         return f"**This run failed**: {failed}."
     total = stats["frames"] + stats["dropped"]
-    share = "all" if stats["tracked"] == total else f"{thousands(stats['tracked'])} of"
+    placed = stats["tracked"] - stats["unplaced"]
+    share = "all" if placed == total else f"{thousands(placed)} of"
     path = f"the camera's path of {length(stats['path_m'])} in {stats['duration_s']:.1f} s"
     known = f"**The camera's position is known for {share} {thousands(total)} images** along {path}"
     listed = {0: "", 1: "; one warning is listed below"}.get(warnings, f"; {warnings} warnings are listed below")

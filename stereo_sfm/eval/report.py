@@ -202,6 +202,9 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
     reasons = sorted({interval["reason"] for interval in stats["lost_intervals"]})
     if reasons:
         out += [f"**WARN**: tracking was lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
+    if 0 < stats["unplaced"] < stats["tracked"]:
+        unplaced = f"{thousands(stats['unplaced'])} of the tracked frames were not found in the map"
+        out.append(f"**WARN**: {unplaced}: show the camera places that it has")
     if stats["pieces"] > 1:
         out.append(
             f"**WARN**: the map is in {stats['pieces']} unconnected submaps: tracking restarted, and no place of one "

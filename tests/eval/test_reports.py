@@ -86,7 +86,8 @@ def test_pass_is_more_than_poses(good: dict[str, Any]) -> None:
     (line,) = verdicts(good, {})
     assert line.startswith("**PASS**") and "200 points" in line and "row error" in line
     assert "is known for all 15 images" in headline(good, {}, 0) and "no true path" in headline(good, {}, 0)
-    for fault in ({"inliers_median": 20.0}, {"pieces": 2}, {"row_errors": {**good["row_errors"], "warning": "x"}}):
+    row_errors = {**good["row_errors"], "warning": "x"}
+    for fault in ({"inliers_median": 20.0}, {"pieces": 2}, {"row_errors": row_errors}, {"unplaced": 3}):
         lines = verdicts({**good, **fault}, {})
         assert len(lines) == 1 and lines[0].startswith("**WARN**")
     odd = verdicts({**good, "warnings": ["a message cannot be read", "no IMU"]}, {})

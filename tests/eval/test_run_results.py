@@ -107,9 +107,11 @@ def test_frames_without_a_place_in_the_map_are_left_out(tmp_path: Path) -> None:
     record = record_of(camera_path(), 10)
     mapped = record.mapped()
     assert mapped is not None and len(mapped) == COUNT - 10 and len(record.odometry()) == COUNT
-    stats, lines, _ = results(tmp_path, record, pinhole_rig(), Config())
+    stats, lines, report = results(tmp_path, record, pinhole_rig(), Config())
     assert stats["unplaced"] == 10 and failure(stats) == ""
     assert any("10 of the tracked frames were not found in the map" in line for line in lines)
+    assert "is known for 20 of 30 images" in report
+    assert "**WARN**: 10 of the tracked frames were not found in the map" in report
 
 
 def test_lost_intervals_and_gaps_are_in_the_report(tmp_path: Path) -> None:
