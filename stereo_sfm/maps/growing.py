@@ -185,8 +185,8 @@ class GrowingMap:
             obs = obs[np.sort(once)]
             where = rows[s.obs_pt[obs]], s.uv_left[obs], s.uv_right[obs], s.descriptors[obs]
             map_.observe(int(anchors[k]), *where)
-        rows = rows[fresh]
-        map_.points.seen[rows], map_.points.expected[rows] = s.seen[fresh], s.expected[fresh]
+        own = map_.points.pt_id[rows] == pt_ids  # not one with a point of the saved map
+        map_.points.seen[rows[own]], map_.points.expected[rows[own]] = s.seen[own], s.expected[own]
         order = np.argsort(keys, kind="stable")
         self._keys, self._key_pt = keys[order], pt_ids[s.obs_pt[order]]
         return pt_ids

@@ -85,6 +85,18 @@ def test_a_session_is_joined_as_it_goes_on() -> None:
     assert left and left < ends and all(joining.map.keyframes.alive[joining.map.kf_row(kf_id)] for kf_id in left)
 
 
+def test_points_are_expected_as_often_as_in_the_session() -> None:
+    """Also those joined before: `map prune --min-seen-share` compares that with how often they were seen."""
+    _, _, saved, walk, vocabulary, _, place = second_drive()
+    growing, s = GrowingMap(saved, vocabulary, Config()), walk.snapshot
+    growing.take(first(walk, int(np.searchsorted(s.kf_ids, place.kf_id)) + 1), place)
+    growing.take(dataclasses.replace(walk, snapshot=dataclasses.replace(s, expected=3 * s.seen)), place)
+    map_ = growing._map  # pyright: ignore[reportPrivateUsage]
+    rows = map_.living_points()
+    rows = rows[map_.points.pt_id[rows] > saved.snapshot.pt_ids.max()]  # not one with a point of the saved map
+    assert len(rows) and np.array_equal(map_.points.expected[rows], 3 * map_.points.seen[rows])
+
+
 def test_what_the_session_culled_takes_no_memory() -> None:
     _, _, saved, walk, vocabulary, _, place = second_drive()
     growing, begin = (
