@@ -59,8 +59,9 @@ def discard_files(folder: Path) -> None:
     """Remove the files of a run; other files stay."""
     made_later = [*folder.glob("export_*"), *folder.glob("matches/*.png")]
     if (folder / KEPT_MAP / "map.json").is_file():
-        made_later += [folder / KEPT_MAP / name for name in ("map.json", "rig.yaml")]
-        made_later += [*(folder / KEPT_MAP).glob("*.npz")]
+        from stereo_sfm.maps.saved_map import map_files
+
+        made_later += [folder / KEPT_MAP / name for name in map_files()]
     for path in [*(folder / name for name in FILES), *(path for path in made_later if path.is_file())]:
         path.unlink(missing_ok=True)
 

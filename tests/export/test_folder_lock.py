@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.run_folder import prepare_folder
+from stereo_sfm.export.run_folder import KEPT_MAP, prepare_folder
+from stereo_sfm.maps.saved_map import map_files
 
 OTHER = """
 import sys, time
@@ -38,3 +39,11 @@ def test_overwriting_an_active_run_is_an_error_and_changes_no_file(tmp_path: Pat
         prepare_folder(tmp_path, overwrite=True)
     del lock
     prepare_folder(tmp_path, overwrite=True)
+
+
+def test_an_overwritten_run_leaves_nothing_of_its_map(tmp_path: Path) -> None:
+    (tmp_path / KEPT_MAP).mkdir()
+    for name in (*map_files(), "notes.txt"):
+        (tmp_path / KEPT_MAP / name).write_text("of the run before")
+    prepare_folder(tmp_path, overwrite=True)
+    assert [path.name for path in (tmp_path / KEPT_MAP).iterdir()] == ["notes.txt"]
