@@ -106,6 +106,7 @@ def with_sticking(finding: StartFinding, rig: Rig, images: Iterable[StereoImage]
     if finding.text:
         corrected = None if finding.rig is None else without_sticking(finding.rig, parts)
         text = f"{finding.text}; and {text}"
+        masked = masked if corrected is not None or not finding.shown else None  # which would not mend a mistake
         return replace(finding, text=text, rig=corrected or finding.rig, shown=True, masked=masked)
     return replace(finding, text=text, shown=True, advice=MASK, masked=masked)
 

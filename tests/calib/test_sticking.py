@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
-from stereo_sfm.calib.sticking import positions, sticking, still_side
+from stereo_sfm.calib.start import StartFinding
+from stereo_sfm.calib.sticking import positions, sticking, still_side, with_sticking
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.start_checked import StartCheckedSource
 from stereo_sfm.geometry import se3
@@ -98,6 +99,16 @@ def test_a_run_has_the_mask_and_says_so(data_root: Path) -> None:
         assert (mask is not None and 0.7 < mask.mean() < 0.99) if count == 300 else not found.rig  # exit code 4
         with StartCheckedSource(MemorySource(masked, stuck), correct=True) as checked:
             assert (checked.start_check is None) == (count == 300)  # with that mask nothing is left to say
+
+
+def test_a_mask_does_not_mend_a_mistake(data_root: Path) -> None:
+    """Else the run counts as corrected, and its exit code is 0."""
+    with s.open_source(data_root / "kitti") as source:
+        rig, good = source.rig, list(source.at(positions(source.frame_count)))
+    stuck = [replace(image, left=dots(image.left)) for image in good]
+    for shown in (True, False):
+        finding = with_sticking(StartFinding("left and right are exchanged", shown=shown), rig, iter(stuck))
+        assert finding.shown and (finding.masked is None) == shown
 
 
 def passed(image: U8, k: int) -> U8:
