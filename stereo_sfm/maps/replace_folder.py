@@ -29,15 +29,15 @@ def replaced_folder(folder: Path, names: frozenset[str], synced: bool = True) ->
     try:
         yield draft
         for path in draft.iterdir() if synced else ():
-            _sync(path)
+            sync(path)
         if keep:
             draft.rename(folder / COMPLETE)
-            _sync(folder)
+            sync(folder)
             _take_complete(folder)
         else:
             _swap(draft, folder, names)
         if synced:
-            _sync(folder.parent)
+            sync(folder.parent)
     finally:
         _remove(draft)
 
@@ -74,7 +74,7 @@ def _take_complete(folder: Path) -> None:
     complete.rmdir()
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
     """A file or folder survives a loss of power from now on."""
     descriptor = os.open(path, os.O_RDONLY)
     with contextlib.suppress(OSError):  # a file system that cannot

@@ -99,10 +99,9 @@ class MapKeeper:
         """
         with self._lock:
             if self._next_folder is not None:
-                extends = self.mode == "extend"
-                self._store.release()
-                self._store = MapStore(self._next_folder, self.mode, self._store.config, _fresh=extends)
-                self._next_folder = None
+                self._leave_store()
+                mode = "extend" if self._store.saves else self.mode  # a map that was chosen is continued
+                self._store, self._next_folder = MapStore(self._next_folder, mode, self._store.config), None
             folders = self._store.begin(lambda: self._ending)
             self._asked = self._answered = self._ended = 0
             self._again, self._taken = False, None
@@ -113,6 +112,13 @@ class MapKeeper:
         self._session_saved.clear()
         self._schedule()
         return folders
+
+    def _leave_store(self) -> None:
+        """Others may write to the saved map; what of its session is not in it is joined when it is continued."""
+        self._store.cancel()
+        if self._store.saves and self._store.whole:
+            self._store.finished()
+        self._store.release()
 
     def session_saved(self, message: MapSaved) -> None:
         """The session's part is on disk, or cannot be: the saved map follows from it."""

@@ -2,20 +2,22 @@
 
 While the service runs, two folders are beside the map's folder STORE: `.STORE.base`, the map that the session began
 with, and `.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into
-STORE as the session goes on, so that STORE is a complete map whenever the power fails. What was not joined at the end
-is joined at the next start. A service that changes STORE holds its lock as long as it runs: `map update` and the like
-have to wait.
+STORE as the session goes on, so that STORE is a complete map whenever the power fails. `.STORE.saved` holds the
+checksum of STORE as it was written last. What was not joined at the end is joined at the next start, if STORE is still
+that map; else it is kept under another name. A service that changes STORE holds its lock as long as it runs:
+`map update` and the like have to wait.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import shutil
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -24,9 +26,9 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
-from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.folders import MapFolders, map_sha256
 from stereo_sfm.maps.growing import GrowingMap
-from stereo_sfm.maps.replace_folder import recover
+from stereo_sfm.maps.replace_folder import recover, sync
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.maps.store import lock, lock_versioned
 from stereo_sfm.maps.unfinished import copy_map, load_place, publish
@@ -64,7 +66,9 @@ class MapStore:
     _waiting: int = 0  # requests to join without a result
     _died: bool = False  # the process ended by itself: the next request starts another one
     _done: Joined | None = None
-    _fresh: bool = field(default=True)  # no session has begun yet
+    _fresh: bool = True  # no session has begun yet
+    _asked: tuple[int, int] | None = None  # what was written when a join was requested last
+    _joined: tuple[int, int] | None = None  # the same, of the last join that succeeded
     _lock: FolderLock | None = None  # of the saved map, from the first session on
 
     @property
@@ -76,6 +80,16 @@ class MapStore:
     def session(self) -> Path:
         """The session's own part."""
         return self.folder.with_name(f".{self.folder.name}.session")
+
+    @property
+    def _base_folder(self) -> Path:
+        """The map that the session began with."""
+        return self.folder.with_name(f".{self.folder.name}.base")
+
+    @property
+    def whole(self) -> bool:
+        """Whether all that the session has written is in the saved map."""
+        return self.written() in (None, self._joined)
 
     def written(self) -> tuple[int, int] | None:
         """Tells the session's own part, as it was completely written last, from others; None if there is none."""
@@ -101,7 +115,7 @@ class MapStore:
             raise StereoSfmError(f"cannot use map.folder {self.folder}: {error.strerror or error}") from None
 
     def _begin(self, stopped: Callable[[], bool]) -> MapFolders:
-        base = self.folder.with_name(f".{self.folder.name}.base")
+        base = self._base_folder
         if self.mode == "none":
             return MapFolders()
         if self.saves and self._lock is None:
@@ -122,8 +136,7 @@ class MapStore:
             if self.mode == "new" and (self.folder / "map.json").exists():
                 self._set_aside()
         self._fresh = False
-        shutil.rmtree(self.session, ignore_errors=True)
-        shutil.rmtree(base, ignore_errors=True)
+        self.finished()
         self._base, self._died = None, False
         if (self.folder / "map.json").exists():
             self.saved_ns = max(self.saved_ns, (self.folder / "map.json").stat().st_mtime_ns)
@@ -137,11 +150,27 @@ class MapStore:
 
     def _keep_aside(self, folder: Path) -> Path:
         """Rename the saved map or the session; returns its new name."""
-        return folder.rename(self.folder.with_name(f"{self.folder.name}_{time.strftime('%Y%m%d_%H%M%S')}"))
+        name = f"{self.folder.name}_{time.strftime('%Y%m%d_%H%M%S')}"
+        names = itertools.chain([name], (f"{name}_{k}" for k in itertools.count(2)))
+        return folder.rename(next(to for to in map(self.folder.with_name, names) if not to.exists()))
+
+    def _is_as_left(self) -> bool:
+        """Whether the saved map is what was written last, or what the unfinished session began with."""
+        try:
+            left = _saved_file(self.folder).read_text(encoding="utf-8")
+        except FileNotFoundError:  # nothing was joined
+            left = _checksum(self._base_folder)
+        return _checksum(self.folder) == left
 
     def _join_left_over(self, base: Path, stopped: Callable[[], bool]) -> bool:
         """In a process of its own, which a stop ends. Returns whether nothing is left to join."""
-        if self.mode != "extend" or not (self.session / "map.json").exists():
+        if not (self.session / "map.json").exists():
+            return True
+        if not self._is_as_left():
+            log.warning(
+                "%s is not the map that its last session continued any more: that session is not added, it is %s now "
+                "('stereo-sfm map update' adds it)", self.folder, self._keep_aside(self.session),
+            )  # fmt: skip
             return True
         if (base / "map.json").exists():
             self._result, send = pipe()
@@ -173,6 +202,7 @@ class MapStore:
 
     def join(self) -> None:
         """Begin to write the saved map from the session's part as it is now."""
+        self._asked = self.written()
         if self._base is None:
             self._done = _published(None, self.session, self.folder, self.config)
             return
@@ -222,6 +252,7 @@ class MapStore:
         assert result is not None
         if not result.why:
             self.saved_ns = time.time_ns()
+            self._joined = None if self.joining else self._asked
         return result
 
     def cancel(self) -> None:
@@ -243,8 +274,11 @@ class MapStore:
 
     def finished(self) -> None:
         """The session is in the saved map: nothing is left to do at the next start."""
-        for folder in (self.session, self.folder.with_name(f".{self.folder.name}.base")):
+        for folder in (self.session, self._base_folder):
             shutil.rmtree(folder, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            _saved_file(self.folder).unlink()
+        self._asked = self._joined = None
 
 
 def _keep_joined(base: Path, session: Path, out: Path, config: Config, requests: Connection, send: Connection) -> None:
@@ -309,6 +343,7 @@ def _grown(growing: GrowingMap, session: Path, out: Path) -> Joined:
         growing.take(load_map(session), load_place(session))
         saved = growing.saved()
         save_map(saved, out, compress=False)  # a fifth larger, in a sixth of the processor time
+        _remember(out)
     except (StereoSfmError, OSError) as error:
         return Joined(why=str(error))
     return Joined(len(saved))
@@ -316,6 +351,28 @@ def _grown(growing: GrowingMap, session: Path, out: Path) -> Joined:
 
 def _published(base: Path | None, session: Path, out: Path, config: Config) -> Joined:
     try:
-        return Joined(publish(base, session, out, config))
+        keyframes = publish(base, session, out, config)
+        _remember(out)
     except (StereoSfmError, OSError) as error:
         return Joined(why=str(error))
+    return Joined(keyframes)
+
+
+def _saved_file(folder: Path) -> Path:
+    """Holds the checksum of the saved map as it was written last."""
+    return folder.with_name(f".{folder.name}.saved")
+
+
+def _checksum(folder: Path) -> str:
+    """Identifies a map; "" where there is none."""
+    return map_sha256(folder) if (folder / "map.json").exists() else ""
+
+
+def _remember(folder: Path) -> None:
+    """Note what was written; it survives a loss of power, as the map does."""
+    file = _saved_file(folder)
+    draft = file.with_name(f"{file.name}.partial")
+    draft.write_text(_checksum(folder), encoding="utf-8")
+    sync(draft)
+    draft.replace(file)
+    sync(file.parent)

@@ -134,6 +134,57 @@ def test_a_left_over_session_is_joined_before_the_next(based: bool, tmp_path: Pa
     assert len(load_map(folders.map_in)) == len(load_map(tmp_path / "store")) == len(small_map()[1])
 
 
+@pytest.mark.parametrize("since", ["changed", "removed", "saved"])
+def test_a_left_over_session_is_joined_only_with_the_map_that_it_continued(
+    since: str, tmp_path: Path, caplog: Any
+) -> None:
+    store, saved = tmp_path / "store", small_map()[1]
+    maps = keeper(tmp_path)
+    session = maps._store.session  # pyright: ignore[reportPrivateUsage]
+    unfinished.save_session(saved, None, session)
+    maps.session_saved(MapSaved("", len(saved)))
+    maps._store.release()  # pyright: ignore[reportPrivateUsage]
+    if since != "saved":
+        shutil.rmtree(store)
+    if since == "changed":
+        save_map(small_map(1)[1], store)
+    before = map_store._checksum(store)  # pyright: ignore[reportPrivateUsage]
+    with caplog.at_level("INFO"):
+        folders = keeper(tmp_path)._store.begin()  # pyright: ignore[reportPrivateUsage]
+    assert map_store._checksum(store) == before and not session.exists()  # pyright: ignore[reportPrivateUsage]
+    aside = list(tmp_path.glob("store_*"))
+    if since == "saved":
+        assert not aside and "last session was added to the saved map" in caplog.text
+    else:
+        assert len(load_map(aside[0])) == len(saved) and f"it is {aside[0]} now" in caplog.text
+    assert (folders.map_in is None) == (since == "removed")
+
+
+def test_a_new_map_begins_after_the_left_over_session_is_joined(tmp_path: Path) -> None:
+    unfinished.save_session(small_map()[1], None, tmp_path / ".store.session")
+    maps = MapKeeper(MapConfig(str(tmp_path / "store"), "new"), Config())
+    assert maps.begin().map_in is None
+    (aside,) = tmp_path.glob("store_*")
+    assert len(load_map(aside)) == len(small_map()[1])
+    save_map(small_map()[1], tmp_path / "other")
+    maps.switch(tmp_path / "other")
+    assert maps.begin().map_in == tmp_path / ".other.base" and (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_who_leaves_a_map_leaves_what_is_not_in_it_only(whole: bool, tmp_path: Path) -> None:
+    maps, saved = keeper(tmp_path), small_map()[1]
+    unfinished.save_session(saved, None, tmp_path / ".store.session")
+    maps.session_saved(MapSaved("", len(saved)))
+    maps.check(None)
+    if not whole:
+        unfinished.save_session(saved, None, tmp_path / ".store.session")
+    maps.switch(tmp_path / "other")
+    maps.begin()
+    beside = {".store.session", ".store.saved"}
+    assert beside & {path.name for path in tmp_path.iterdir()} == (set() if whole else beside)
+
+
 def test_a_requested_save_is_answered_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_keeper, "SAVE_S", 0.05)
     session: Any = SlowSession()
