@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan, write_floor_plan
@@ -38,6 +39,7 @@ from stereo_sfm.service.outputs.settings import (
 )
 from stereo_sfm.service.page import app, server
 from stereo_sfm.service.page.server import PageOutput
+from stereo_sfm.service.page.state import PageState
 from stereo_sfm.service.page.verdicts import GOOD, Verdicts, problems
 from stereo_sfm.service.publisher import COMMANDS, Reply
 from stereo_sfm.types import U8
@@ -113,6 +115,12 @@ def _plan() -> tuple[U8, float, tuple[float, float]]:
     image[:, :3] = image[:, -3:] = OCCUPIED
     image[40:50, 64:80] = OCCUPIED
     return image, 0.05, (-0.8, -1.5)
+
+
+def _tilted() -> Rig:
+    """A camera that looks half down."""
+    rig = started().rig
+    return replace(rig, body_T_left=se3.exp(np.array([0, 0, 0, 0, 0.7, 0.3])) @ rig.base_T_left)
 
 
 def _press(browser: Browser, key: str, code: str, text: str = "") -> None:
@@ -298,13 +306,16 @@ def test_a_point_without_a_place_is_not_shown() -> None:
 def test_the_floor_plan_is_in_the_axes_of_the_poses() -> None:
     with _serving() as output:
         assert _ask(output, "GET", "/api/floor_plan.png")[0] == 204
-        output.put(started())
         state = output._state  # pyright: ignore[reportPrivateUsage]
         left_T_robot = np.linalg.inv(RobotAxes(started().rig).base_T_left)
         state._take_plan(*_plan(), left_T_robot)  # pyright: ignore[reportPrivateUsage]
+        state.put(started(_tilted()))
+        tilted = json.loads(state.snapshot())["plan"]
+        state.put(started())
         extent = json.loads(state.snapshot())["plan"]
         code, data, headers = _ask(output, "GET", "/api/floor_plan.png")
-    assert code == 200 and headers["content-type"] == "image/png" and extent["version"] == 1
+    assert code == 200 and headers["content-type"] == "image/png" and extent["version"] > tilted["version"]
+    assert extent["x"] != tilted["x"]
     image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
 
     def pixel(x: float, y: float) -> list[int]:
@@ -313,6 +324,21 @@ def test_the_floor_plan_is_in_the_axes_of_the_poses() -> None:
     assert pixel(2.8, 0.25) == [60, 50, 40, 255]  # the shelf
     assert pixel(1.0, 0.25) == pixel(2.8, 0.75) == [255, 255, 255, 255]
     assert image.shape[0] * 0.05 == pytest.approx(extent["along_x"])
+
+
+def test_what_a_service_shows_after_a_restart_has_other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page that was open meanwhile asks for it."""
+    versions = list[tuple[int, int]]()
+    for now_s in (1_700_000_000, 1_700_000_009):
+        monkeypatch.setattr(time, "time_ns", lambda now_s=now_s: now_s * 10**9)
+        state = PageState()
+        state.put(started())
+        state._take_plan(*_plan(), np.eye(4))  # pyright: ignore[reportPrivateUsage]
+        state.put(cloud(30, 3))
+        shown = json.loads(state.snapshot())
+        assert shown["map_version"] == json.loads(state.map())["version"]
+        versions.append((shown["plan"]["version"], shown["map_version"]))
+    assert not set(versions[0]) & set(versions[1])
 
 
 def _surface(folder: Path, height: int = 20, width: int = 30) -> None:
@@ -333,6 +359,10 @@ def test_a_surface_lies_under_the_map(tmp_path: Path) -> None:
         _surface(tmp_path)
         extent = json.loads(_ask(output, "GET", "/api/surface")[1])
         code, data, headers = _ask(output, "GET", "/api/surface.png")
+        output._state.put(started(_tilted()))  # pyright: ignore[reportPrivateUsage]
+        tilted = json.loads(_ask(output, "GET", "/api/surface")[1])
+        output._state.put(started())  # pyright: ignore[reportPrivateUsage]
+        assert tilted["version"] != extent["version"] and tilted["x"] != extent["x"]
         _surface(tmp_path, 2400, 5000)
         large = json.loads(_ask(output, "GET", "/api/surface")[1])
         reduced = cv2.imdecode(np.frombuffer(_ask(output, "GET", "/api/surface.png")[1], np.uint8), -1)

@@ -121,6 +121,22 @@ def test_nodes_receive_poses_cloud_path_and_plan() -> None:
     assert (grid.info.width, grid.info.height) and set(grid.data) <= {-1, 0, 100} and 0 in grid.data
 
 
+def test_a_floor_plan_that_is_ready_before_the_camera_is_published_with_it() -> None:
+    from nav_msgs.msg import OccupancyGrid
+
+    output, listener = Ros2Output(Ros2Config(True)), Listener()
+    try:
+        output.open(FakeService())
+        listener.listen("floor_plan", OccupancyGrid, True)
+        plan = np.full((20, 30), 254, np.uint8)
+        output._take_plan(plan, 0.1, (0.0, 0.0), np.diag([1.0, -1, -1, 1]))  # pyright: ignore[reportPrivateUsage]
+        output.put(started())
+        listener.until(lambda: bool(listener.got["floor_plan"]))
+    finally:
+        output.close()
+        listener.close()
+
+
 def test_nodes_receive_depth_and_obstacles() -> None:
     """As Nav2's layers do: the obstacles are in the robot's frame."""
     from rclpy.qos import qos_profile_sensor_data

@@ -24,6 +24,7 @@ from stereo_sfm.types import F64, U8
 log = logging.getLogger("stereo_sfm")
 
 LONGEST_S = 120.0
+RawPlan = tuple[U8, float, tuple[float, float], F64]  # the arguments of `aligned`, in the left camera's axes
 CELLS: dict[int, int] = {FREE: 0, OCCUPIED: 100, UNKNOWN: -1}  # of nav_msgs/OccupancyGrid
 
 

@@ -16,7 +16,7 @@ from stereo_sfm.drivers.ros2.this_computer import keep_here
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.messages import HealthReport, MapCloud, PoseUpdate, ServiceMessage, Started, Status
 from stereo_sfm.service.outputs import dds_memory
-from stereo_sfm.service.outputs.floor_grid import FloorGrids, aligned
+from stereo_sfm.service.outputs.floor_grid import FloorGrids, RawPlan, aligned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.settings import Ros2Config
 from stereo_sfm.service.publisher import COMMANDS, ServiceClient
@@ -68,6 +68,7 @@ class Ros2Output:
         self._stamp_ns = 0  # of the newest pose
         self._clock_ns = 0  # wall clock minus the camera's
         self._plans = FloorGrids(self._take_plan)
+        self._plan: RawPlan | None = None  # the newest
         self._topics: dict[str, Any] = {}
         self._node: Any = None
         self._lock = threading.Lock()
@@ -187,6 +188,7 @@ class Ros2Output:
 
     def _started(self, started: Started) -> None:
         self._axes = RobotAxes(started.rig)
+        self._publish_plan()
         if "/tf_static" not in self._topics:
             return
         from tf2_msgs.msg import TFMessage
@@ -252,13 +254,19 @@ class Ros2Output:
 
     def _take_plan(self, image: U8, resolution: float, origin: tuple[float, float], map_T_floor: F64) -> None:
         """A new floor plan, from another thread."""
+        with self._lock:
+            self._plan = image, resolution, origin, map_T_floor
+            self._publish_plan()
+
+    def _publish_plan(self) -> None:
+        """The floor plan in the axes of the poses, once both are known."""
         from stereo_sfm.service.outputs import ros2_messages as ros
 
-        with self._lock:
-            if self._axes is None:
-                return
-            plan = aligned(image, resolution, origin, self._axes.in_map(map_T_floor))
-            self._topics["floor_plan"].publish(ros.grid(self._now(), self._config.map_frame, plan))
+        if self._axes is None or self._plan is None:
+            return
+        image, resolution, origin, map_T_floor = self._plan
+        plan = aligned(image, resolution, origin, self._axes.in_map(map_T_floor))
+        self._topics["floor_plan"].publish(ros.grid(self._now(), self._config.map_frame, plan))
 
     def _now(self) -> int:
         """The newest pose's stamp, or the wall clock before there is one."""

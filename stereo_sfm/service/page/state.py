@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 import time
@@ -23,7 +24,7 @@ from stereo_sfm.service.messages import (
     Started,
     Status,
 )
-from stereo_sfm.service.outputs.floor_grid import FloorGrid, FloorGrids, aligned
+from stereo_sfm.service.outputs.floor_grid import FloorGrid, FloorGrids, RawPlan, aligned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.types import F64, U8
 
@@ -49,6 +50,8 @@ class PageState:
         self._jpeg = b""
         self._plan_png = b""
         self._plans = FloorGrids(self._take_plan)
+        self._plan: RawPlan | None = None  # the newest
+        self._versions = itertools.count(time.time_ns() // 1_000_000)  # an open page outlives a service
         self._watched = self._viewed = -WATCHED_S
 
     def put(self, message: ServiceMessage) -> None:
@@ -65,6 +68,7 @@ class PageState:
         if isinstance(message, Started):
             self._axes = RobotAxes(message.rig)
             self._values["source"] = message.source
+            self._draw_plan()
         elif isinstance(message, Status):
             self._values["status"] = asdict(message)
             if time.monotonic() - self._viewed < WATCHED_S:
@@ -85,8 +89,7 @@ class PageState:
         path = axes.cameras(cloud.map_T_kf)[:, :3, 3]
         path = path[:: 1 + len(path) // MOST_KEYFRAMES]
         with self._lock:
-            version = self._values["map_version"] + 1
-            self._values["map_version"] = version
+            version = self._values["map_version"] = next(self._versions)
             self._map = {"version": version, "points": _rounded(points), "path": _rounded(path[:, :2])}
 
     def _take_image(self, preview: PreviewImage) -> None:
@@ -95,13 +98,17 @@ class PageState:
 
     def _take_plan(self, image: U8, resolution: float, origin: tuple[float, float], map_T_floor: F64) -> None:
         """A new floor plan of the saved map, in a thread of its own."""
-        axes = self._axes
-        if axes is None:
-            return
-        grid = aligned(image, resolution, origin, axes.in_map(map_T_floor))
         with self._lock:
-            version = self._values["plan"]["version"] + 1 if self._values["plan"] else 1
-            self._plan_png, self._values["plan"] = _plan_png(grid), {"version": version, **_plan_extent(grid)}
+            self._plan = image, resolution, origin, map_T_floor
+            self._draw_plan()
+
+    def _draw_plan(self) -> None:
+        """The floor plan in the axes of the poses, once both are known."""
+        if self._axes is None or self._plan is None:
+            return
+        image, resolution, origin, map_T_floor = self._plan
+        grid = aligned(image, resolution, origin, self._axes.in_map(map_T_floor))
+        self._plan_png, self._values["plan"] = _plan_png(grid), {"version": next(self._versions), **_plan_extent(grid)}
 
     @property
     def axes(self) -> RobotAxes | None:

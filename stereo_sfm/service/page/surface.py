@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,11 +28,11 @@ class SurfacePicture:
 
 
 class SurfacePictures:
-    """The newest picture in a folder, read again when it was written again."""
+    """The newest picture in a folder, read again when it was written again, or lies in other axes."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._lock = folder, threading.Lock()
-        self._made_of = 0  # ns, when the picture was written
+        self._made_of = ""  # version: when the picture was written, and the axes
         self._newest: SurfacePicture | None = None
 
     def newest(self, axes: RobotAxes) -> SurfacePicture | None:
@@ -39,14 +40,15 @@ class SurfacePictures:
         with self._lock:
             try:
                 written = (self._folder / PICTURE).stat().st_mtime_ns
-                if written != self._made_of:
-                    self._made_of, self._newest = written, None
-                    self._newest = self._made(axes, written)
+                version = f"{written}-{zlib.crc32(axes.base_T_left.tobytes())}"
+                if version != self._made_of:
+                    self._made_of, self._newest = version, None
+                    self._newest = self._made(axes, version)
             except (OSError, ValueError, LookupError, TypeError, cv2.error):
                 return None
             return self._newest
 
-    def _made(self, axes: RobotAxes, written: int) -> SurfacePicture | None:
+    def _made(self, axes: RobotAxes, version: str) -> SurfacePicture | None:
         image = cv2.imdecode(np.frombuffer(read_bytes(self._folder / PICTURE), np.uint8), cv2.IMREAD_UNCHANGED)
         about = read_yaml(self._folder / ABOUT)
         if image is None or image.ndim != 3 or image.shape[2] != 4:
@@ -60,7 +62,7 @@ class SurfacePictures:
         x, y = float(corner[0]) + along_x, float(corner[1]) + along_y
         png = cv2.imencode(".png", flat.transpose(1, 0, 2)[::-1, ::-1])[1].tobytes()
         extent: dict[str, float | str] = {
-            "version": str(written),
+            "version": version,
             "x": x,
             "y": y,
             "along_x": along_x,
