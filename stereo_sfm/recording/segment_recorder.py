@@ -20,6 +20,7 @@ from pathlib import Path
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.provenance import Opening, write_provenance
 from stereo_sfm.log.run_log import RunLog
@@ -66,7 +67,7 @@ class RecorderState:
 
 
 class SegmentRecorder:
-    """One recording. `image`, `put` and `mark` never block."""
+    """One recording, in a folder that no other recorder uses meanwhile. `image`, `put` and `mark` never block."""
 
     def __init__(
         self,
@@ -82,8 +83,11 @@ class SegmentRecorder:
 
         Raises:
             OSError: the folder cannot be made.
+            StereoSfmError: another service records there.
         """
         self._policy, self._disk = policy, disk
+        policy.root.mkdir(parents=True, exist_ok=True)
+        self._lock = FolderLock(policy.root, "another service records there, choose another recording.folder")
         self._about = (source, policy.mode, datetime.now())
         self.folder = new_recording(policy.root, *self._about)
         self._folder_gone = False
@@ -175,6 +179,7 @@ class SegmentRecorder:
             writer.close()
         for writer in (self._poses, self._images):
             writer.join(max(until - time.monotonic(), 0.1))
+        self._lock.release()
 
     # -- segments ----------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.errors import disk_is_full
+from stereo_sfm.errors import StereoSfmError, disk_is_full
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.child import raise_priority
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
@@ -129,6 +129,9 @@ class _Body:
         except OSError as error:
             self._problem, self._full = f"cannot record to {begin.policy.root}: {error.strerror}", disk_is_full(error)
             return
+        except StereoSfmError as error:
+            self._problem, self._full = str(error), False
+            return
         for message in self._waiting:
             _put(self._recorder, message, self._problem)
         self._waiting.clear()
@@ -164,7 +167,7 @@ class _Body:
             self._recorder.image(image)
 
     def _open_again(self, begin: Begin) -> None:
-        """The folder could not be made: another attempt, once a second."""
+        """The folder could not be made, or used: another attempt, once a second."""
         if time.monotonic() >= self._next_open_s:
             self._open(begin)
 

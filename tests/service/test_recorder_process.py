@@ -19,7 +19,7 @@ from stereo_sfm.recording.segments import recordings, segments
 from stereo_sfm.service import recorder_process
 from stereo_sfm.service.recorder_process import Begin, Finish
 from tests.pipeline.test_pipeline import SlidingWall
-from tests.recording.test_segments import frame, messages, policy
+from tests.recording.test_segments import frame, messages, policy, start
 
 
 @pytest.mark.parametrize("refused", [20, 30], ids=["some", "all but the end"])
@@ -57,3 +57,22 @@ def test_a_session_that_begins_on_a_full_disk_loses_no_pose(
     if refused < 30:
         with open_source(folder) as recorded:
             assert [i.frame_id for i in recorded] == list(range(refused, 30))
+
+
+def test_a_folder_where_another_service_records_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(recorder_process, "AGAIN_S", 0.0)
+    other, source = start(tmp_path), SlidingWall(2)
+    ring = ImageRing(ImageLayout.of(source.rig), 2)
+    body = recorder_process._Body(SimpleQueue[object]().put)  # pyright: ignore[reportPrivateUsage]
+    about = Config(), "wall", Opening()
+    body.take(Begin(policy(tmp_path), source.rig, *about, (ring.layout, ring.slots, ring.name)))
+    first, second = source
+    body.take((0, ring.write(0, first, 0.0)))
+    assert recordings(tmp_path) == [other.folder]
+    assert "another service records there" in body._problem  # pyright: ignore[reportPrivateUsage]
+    other.close(20.0)
+    body.take((1, ring.write(1, second, 0.0)))
+    assert not body._problem  # pyright: ignore[reportPrivateUsage]
+    body.take(Finish())
+    ring.close()
+    assert len(recordings(tmp_path)) == 2
