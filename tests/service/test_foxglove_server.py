@@ -183,10 +183,13 @@ def test_settings_are_parameters() -> None:
         client.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "a"}))
         values = _wait(client, lambda said: said["parameters"] if said.get("op") == "parameterValues" else None)
         assert {v["name"]: v["value"] for v in values} == {"recording.mode": "off", "page.picture_hz": 4.0}
-        row = {"name": "recording.mode", "value": "full"}
-        client.send(json.dumps({"op": "setParameters", "parameters": [row], "id": "b"}))
+        given = {"recording.mode": "full", "recording.mark_losses": True, "map.save_every_min": 2.5}
+        rows = [{"name": name, "value": value} for name, value in given.items()]
+        client.send(json.dumps({"op": "setParameters", "parameters": rows, "id": "b"}))
         _wait(client, lambda said: said["parameters"] if said.get("op") == "parameterValues" else None)
     assert ("set_setting", {"name": "recording.mode", "value": "full"}) in service.calls
+    assert ("set_setting", {"name": "recording.mark_losses", "value": "true"}) in service.calls
+    assert ("set_setting", {"name": "map.save_every_min", "value": "2.5"}) in service.calls
 
 
 def test_channels_that_are_no_numbers_end_no_connection() -> None:

@@ -199,7 +199,9 @@ class FoxgloveClients:
     async def _set_parameters(self, client: Client, rows: list[dict[str, Any]]) -> list[str]:
         names = [str(row.get("name")) for row in rows]
         for name, row in zip(names, rows, strict=True):
-            text = await run_in_threadpool(self._command, "set_setting", {"name": name, "value": str(row.get("value"))})
+            value = row.get("value")
+            as_text = value if isinstance(value, str) else json.dumps(value)  # true, as TOML writes it, not True
+            text = await run_in_threadpool(self._command, "set_setting", {"name": name, "value": as_text})
             reply = json.loads(text)
             if not reply["ok"]:
                 await client.answer(protocol.problem(f"{name} is not set: {reply['text']}"))
