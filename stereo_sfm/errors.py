@@ -21,6 +21,7 @@ class StereoSfmError(Exception):
     """
 
     exit_code = 2  # of a command that ends with it
+    stage = ""  # of a pipeline in processes, which failed with it
 
 
 def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[StereoSfmError] = StereoSfmError) -> None:

@@ -596,5 +596,5 @@ def _error(failed: Failed) -> StereoSfmError:
     if not failed.ours:
         return StageDied(f"the {failed.stage} process failed:\n{failed.message}")
     error = StereoSfmError(failed.message)
-    error.exit_code = failed.exit_code
+    error.exit_code, error.stage = failed.exit_code, failed.stage
     return error

@@ -12,6 +12,7 @@ from typing import Any
 
 from stereo_sfm.config import parse_override
 from stereo_sfm.errors import StereoSfmError, one_of
+from stereo_sfm.maps.header import read_header
 from stereo_sfm.recording.segments import delete_recording, find_recording, listed, recordings
 from stereo_sfm.service.config import RECORDING_MODES, SEE, RobotConfig
 from stereo_sfm.service.map_keeper import MapKeeper
@@ -82,12 +83,17 @@ class Commands:
         return self._maps.save_now(self._pipelines.session, name)
 
     def load_map(self, name: str) -> Reply:
-        """Continue with another saved map beside the configured folder."""
+        """Continue with another saved map beside the configured folder.
+
+        Raises:
+            StereoSfmError: it is damaged, or of another version.
+        """
         if self._maps.mode == "none":
             return Reply(False, "no map is loaded: map.mode is none")
         folder = self._maps.beside(name)
         if not (folder / "map.json").exists():
             return Reply(False, f"there is no map {name}")
+        read_header(folder, ())
         self._maps.switch(folder)
         self._restart(f"map {name}")
         return Reply(True, f"starting with {folder}")

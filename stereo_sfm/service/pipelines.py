@@ -146,8 +146,7 @@ class Pipelines:
             if self.count == 1:
                 raise
             self._failures += 1
-            self._facts.starting = str(error)
-            log.error("%s; the pipeline is not started yet", error)
+            self._not_started(error)
             return False
         session = self.session = Session(
             self.count, self._opener, self._config, folders, self._hub, self._facts, self._health,
@@ -173,17 +172,26 @@ class Pipelines:
             log.info("%s", error)
             return False
         except StereoSfmError as error:
-            self._source_failed(error, session)
+            self._failed(error, session)
             return False
         finally:
             self.session, self.map_complete = None, session.map_complete
             if isinstance(self._opener, SourceChoice):
                 self._opener = same_camera(self._opener, session.serial)
 
-    def _source_failed(self, error: StereoSfmError, session: Session) -> None:
+    def _not_started(self, error: StereoSfmError) -> None:
+        """Something else than the camera is the reason."""
+        self._facts.starting, self._facts.source_error = str(error), ""
+        log.error("%s; the pipeline is not started yet", error)
+
+    def _failed(self, error: StereoSfmError, session: Session) -> None:
         """A camera is waited for; anything else that cannot even be opened is a mistake of the configuration."""
         if not self._opener.device and not session.frames:
             raise error
+        if error.stage != "capture":
+            self._failures = 0 if session.tracking_s > STABLE_S else self._failures + 1
+            self._not_started(error)
+            return
         if self._facts.source_error != str(error):
             log.warning("%s; trying again every %.0f s", error, REOPEN_S)
         self._facts.source_error = str(error)

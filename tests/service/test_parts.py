@@ -16,22 +16,27 @@ import numpy as np
 import pytest
 
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import SourceChoice
+from stereo_sfm.drivers.choice import MadeSource, SourceChoice
 from stereo_sfm.drivers.repeated import RepeatedSource
 from stereo_sfm.geometry import se3
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized
+from stereo_sfm.pipeline.channels import Failed
 from stereo_sfm.pipeline.images import SlotImage
+from stereo_sfm.pipeline.processes import _error  # pyright: ignore[reportPrivateUsage]
+from stereo_sfm.service import pipelines
 from stereo_sfm.service import recorder as service_recorder
 from stereo_sfm.service.camera import patient, same_camera
 from stereo_sfm.service.commands import Commands
-from stereo_sfm.service.config import RecordingConfig, RobotConfig
+from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
 from stereo_sfm.service.health import HealthCollector, free_bytes
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_cloud import MapCloudBuilder
+from stereo_sfm.service.map_keeper import MapKeeper
 from stereo_sfm.service.messages import Event, MapCloud, ServiceState, Status
 from stereo_sfm.service.notify import SystemdNotifier
+from stereo_sfm.service.pipelines import IMMEDIATE_RESTARTS, Pipelines
 from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.robot_mounting import RobotMounting
@@ -111,6 +116,39 @@ def test_a_command_that_fails_by_an_error_of_ours_is_answered_and_logged(caplog:
     reply = commands.call("reset")
     assert not reply.ok and reply.text.startswith("reset failed")
     assert "AttributeError" in caplog.text
+
+
+@pytest.mark.parametrize("stage", ["capture", "mapper"])
+def test_only_what_capture_says_is_the_cameras(stage: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Refused:
+        """One of its stages ends before the first image."""
+
+        frames, tracking_s, map_complete, serial = 0, 0.0, False, ""
+
+        def __init__(self, *_: object) -> None: ...
+
+        def run(self) -> None:
+            raise _error(Failed(stage, "this is the reason", True, 2))
+
+    monkeypatch.setattr(pipelines, "Session", Refused)
+    maps: Any = SimpleNamespace(begin=MapFolders, session_saved=None, mode="none")
+    facts, nothing = Facts(source_error="no camera was found before"), cast(Any, None)
+    opener = MadeSource(lambda: SlidingWall(1), device=True)
+    tried = Pipelines(opener, Config(), 1.0, maps, nothing, nothing, facts, nothing)
+    for _ in range(5):
+        assert not tried._run_once()  # pyright: ignore[reportPrivateUsage]
+    state = ServiceState.CAMERA_GONE if stage == "capture" else ServiceState.STARTING
+    assert derive_state(facts, 0.0) == (state, "this is the reason")
+    assert (tried._failures > IMMEDIATE_RESTARTS) == (stage == "mapper")  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_map_that_cannot_be_read_is_not_loaded(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "map.json").write_text('{"kind": "stereo_sfm_map", "version": 99}')
+    nothing: Any = None  # a restart would fail
+    maps = MapKeeper(MapConfig(str(tmp_path / "store")), Config())
+    reply = Commands(RobotConfig(), nothing, maps, nothing, nothing, nothing).call("load_map", {"name": "other"})
+    assert not reply.ok and "is version 99, this program reads" in reply.text
 
 
 def test_velocity_and_covariance_are_those_of_the_body() -> None:
