@@ -93,6 +93,9 @@ def build(given: DenseInput, folder: Path, voxel: float, jobs: int, report: Repo
     Args:
         given: the map and its images. folder: for the files; may hold those of an earlier run.
         voxel: metres. jobs: processes; the bits do not depend on them. report: called after each step.
+
+    Raises:
+        StereoSfmError: no keyframe has depth, or none that is precise enough for such voxels.
     """
     map_T_floor = find_floor(given.saved.snapshot)
     for name in ("depth", "cubes"):
@@ -101,6 +104,8 @@ def build(given: DenseInput, folder: Path, voxel: float, jobs: int, report: Repo
         kept, cubes = _depths(given, folder / "depth", voxel, map_T_floor, workers, report)
         if not kept:
             raise StereoSfmError("no keyframe has depth: one camera needs keyframes 10 to 40 cm apart")
+        if not cubes:
+            raise StereoSfmError(f"no depth is precise enough for voxels of {voxel:g} m: choose a larger --voxel")
         places, reach = np.stack([k.floor_T_cam[:3, 3] for k in kept]), np.array([k.reach for k in kept])
         seen_by = ([kept[i] for i in np.flatnonzero(contributes(places, reach, c, voxel))] for c in cubes)
         tasks = ((c, views, folder / "cubes", voxel) for c, views in zip(cubes, seen_by, strict=True))

@@ -113,6 +113,13 @@ def test_a_drive_becomes_files_and_goes_on_where_it_was(tmp_path: Path, monkeypa
     assert image[row + 12, column] == 254, "the floor before it is free"
 
 
+def test_voxels_that_no_depth_is_precise_enough_for_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(StereoSfmError, match="choose a larger --voxel"):
+        module.build(Case(monkeypatch).given, tmp_path, 1e-6, 1)
+
+
 def test_slices_las_and_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     case = Case(monkeypatch)
     bands = (*module.ROBOT, (0.2, 0.6), (5.0, 6.0))
