@@ -4,7 +4,7 @@ While the service runs, two folders are beside the map's folder STORE: `.STORE.b
 with, and `.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into
 STORE as the session goes on, so that STORE is a complete map whenever the power fails. `.STORE.saved` holds the
 checksum of STORE as it was written last. What was not joined at the end is joined at the next start, if STORE is still
-that map; else it is kept under another name. A service that changes STORE holds its lock as long as it runs:
+that map. Else it is kept under another name. A service that changes STORE holds its lock as long as it runs:
 `map update` and the like have to wait.
 """
 
@@ -168,7 +168,7 @@ class MapStore:
             return True
         if not self._is_as_left():
             log.warning(
-                "%s is not the map that its last session continued any more: that session is not added, it is %s now "
+                "%s was changed since its last session, which is not added: it is %s now "
                 "('stereo-sfm map update' adds it)", self.folder, self._keep_aside(self.session),
             )  # fmt: skip
             return True
