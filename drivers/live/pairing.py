@@ -56,6 +56,7 @@ class ContinuityFilter:
         if self._suspects and not self._follows(self._suspects[-1], image):
             self._suspects = []
         self._suspects.append(image)
+        del self._suspects[:-_RELOCK]
         if len(self._suspects) >= _RELOCK and (self._last is None or image.stamp_ns > self._last.stamp_ns):
             self._last, self._suspects = image, []
             return True

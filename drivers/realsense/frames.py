@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, Pair, Pair
 
 log = logging.getLogger("stereo_sfm")
 
+_WRAP_US = 2**32  # the hardware clock and its metadata are microseconds of 32 bits: 71.6 minutes
 _GAIN_ONE = 16.0  # librealsense's gain of an infrared camera without amplification
 
 
@@ -20,7 +22,7 @@ class Frames:
     """Pairs images, and puts inertial samples of the same clock into `motion`.
 
     Images with the dots of the emitter on them are left out where the camera says so. Stamps are those of the middle of
-    the exposure (`sensor_timestamp`) where the camera sends them.
+    the exposure (`sensor_timestamp`) where the camera sends them. They go on where the hardware clock begins again.
 
     Args:
         rs: the library. size: (width, height) that every image must have, px. counters: of the source.
@@ -33,6 +35,7 @@ class Frames:
         self._rs, self._size, self._counters = rs, size, counters
         self._pairer = Pairer(counters, period_ns)
         self._alternate, self._clock, self._other_clock = alternate, "", False
+        self._newest_ns: int | None = None  # stamp of the hardware clock, of an image or a sample
         self.motion = MotionBuffer()
 
     def take(self, frame: Any) -> list[Pair]:
@@ -71,10 +74,21 @@ class Frames:
 
     def _stamp_ns(self, frame: Any) -> int:
         """Of the middle of the exposure: a frame's stamp is of its readout, half an exposure later."""
-        readout = round(frame.get_timestamp() * 1e6)
-        start = self._metadata(frame, "frame_timestamp", -1.0)
-        middle = self._metadata(frame, "sensor_timestamp", -1.0)
-        return readout + round(1e3 * (middle - start)) if min(start, middle) >= 0 else readout
+        readout = self._told_ns(frame)
+        start = self._metadata(frame, "frame_timestamp", math.nan)
+        middle = self._metadata(frame, "sensor_timestamp", math.nan)
+        later_us = (middle - start + _WRAP_US / 2) % _WRAP_US - _WRAP_US / 2  # one of them may have begun again
+        return readout if math.isnan(later_us) else readout + round(1e3 * later_us)
+
+    def _told_ns(self, frame: Any) -> int:
+        """The stamp of a frame; of all that one of the hardware clock may mean, the nearest to the newest."""
+        stamp_ns = round(frame.get_timestamp() * 1e6)
+        if frame.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock:
+            if self._newest_ns is not None:
+                wrap_ns = 1000 * _WRAP_US
+                stamp_ns += round((self._newest_ns - stamp_ns) / wrap_ns) * wrap_ns
+            self._newest_ns = stamp_ns
+        return stamp_ns
 
     def _take_motion(self, frame: Any) -> None:
         """Samples of another clock than the images' are left out, and that is said once."""
@@ -87,7 +101,7 @@ class Frames:
             return
         xyz = frame.get_motion_data()
         is_gyro = frame.get_profile().stream_type() == self._rs.stream.gyro
-        self.motion.add(round(frame.get_timestamp() * 1e6), is_gyro, (xyz.x, xyz.y, xyz.z))
+        self.motion.add(self._told_ns(frame), is_gyro, (xyz.x, xyz.y, xyz.z))
 
 
 def profiles_of(rs: Any, profiles: Any) -> dict[str, Any]:

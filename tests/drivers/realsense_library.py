@@ -161,6 +161,7 @@ class Library:
     stream, option, camera_info = Stream, Names(), Names()
     frame_metadata_value, distortion, format = Names(), Names(), Names()
     playback_status = SimpleNamespace(stopped="stopped")
+    timestamp_domain = SimpleNamespace(hardware_clock="hardware")
 
     def __init__(self, sent: list[Frame], profiles: tuple[Profile, ...] = (LEFT, RIGHT, GYRO, ACCEL)) -> None:
         self.sent, self.attached, self.starts = sent, True, 0

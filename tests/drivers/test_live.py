@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from weakref import WeakSet
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
 from stereo_sfm.drivers.live.clock import ClockMap, TimeLine
 from stereo_sfm.drivers.live.counters import COUNTERS, Counters
 from stereo_sfm.drivers.live.errors import DeviceLost
-from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, Pair, Pairer
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, ContinuityFilter, Pair, Pairer
 
 PERIOD = 33_333_333
 PIXELS = np.zeros((1, 1), np.uint8)
@@ -68,6 +69,17 @@ def test_stamps_from_before_the_start_are_refused() -> None:
     pairer = Pairer(counters := Counters(), PERIOD, now_ns=60_000_000_000)
     assert not any(pairer.push(side, camera_image(0)) for side in (LEFT, RIGHT))
     assert counters["implausible"] == 2
+
+
+def test_refused_images_are_not_kept() -> None:
+    """A clock that goes back is refused for good; three images at most wait for being believed."""
+    lock, kept = ContinuityFilter(PERIOD, None), WeakSet[CameraImage]()
+    assert lock.accept(camera_image(100))
+    for k in range(20):
+        kept.add(image := camera_image(k))
+        assert not lock.accept(image)
+    del image
+    assert len(kept) == 3
 
 
 def test_clock_keeps_the_best_reading_until_there_is_a_good_one() -> None:

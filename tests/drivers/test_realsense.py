@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import DeviceFault, DeviceLost, NotFound
+from stereo_sfm.drivers.live.pairing import Pair
 from stereo_sfm.drivers.realsense import DRIVER, RealSenseOptions
+from stereo_sfm.drivers.realsense.frames import Frames
 from stereo_sfm.errors import StereoSfmError
 from tests.drivers.realsense_library import LEFT, PERIOD_MS, RIGHT, H, Library, W, frames
 
@@ -71,6 +75,34 @@ def test_imu_on_another_clock_is_left_out_once(
     with DRIVER.open("", live()) as source:
         assert all(image.imu is None for image in islice(source, 6))
     assert caplog.text.count("different clocks") == 1
+
+
+def test_the_hardware_clock_begins_again() -> None:
+    """After 2**32 microseconds: images, samples and middles of exposures go on, in whichever order they come."""
+    library, wrap_ms = Library([]), 2**32 / 1e3
+    taken, pairs = Frames(library, SIZE, counters := Counters(), round(1e6 * PERIOD_MS)), list[Pair]()
+    for frame in frames(200):
+        at = frame.stamp_ms - 1985.0 + wrap_ms  # of 2 s
+        told = {"frame_timestamp": 1e3 * at % 2**32, "sensor_timestamp": 1e3 * (at - 4.0) % 2**32}
+        pairs += taken.take(replace(frame, stamp_ms=at % wrap_ms, metadata=told))
+    stamps = np.array([pair.left.stamp_ns for pair in pairs])
+    assert len(pairs) == 200 and not counters["implausible"]
+    assert set(np.diff(stamps)) == {round(1e6 * PERIOD_MS)}
+    assert stamps[0] == pytest.approx(1e6 * (wrap_ms - 989.0), abs=1)
+    samples = taken.motion.take(int(stamps[-1]) + 10_000_000)
+    assert samples is not None and samples.stamp_ns[-1] - stamps[-1] == pytest.approx(1e6, abs=2)
+    left, right = frames(1)[2:]
+    system = [replace(left, clock="system", stamp_ms=left.stamp_ms + wrap_ms), replace(right, clock="system")]
+    other = Frames(library, SIZE, counters, 0)
+    assert not any(other.take(frame) for frame in system)  # another clock has no such end
+
+
+def test_a_camera_that_appears_between_two_searches(monkeypatch: pytest.MonkeyPatch) -> None:
+    library = use(Library(frames(5)), monkeypatch)
+    there = iter((True, False))  # when the source is made and when it starts
+    monkeypatch.setattr(library, "query_devices", lambda: [library] if next(there, True) else [])
+    with pytest.raises(NotFound, match="no RealSense attached"):
+        DRIVER.open("", live())
 
 
 def test_no_camera_another_camera_no_library(monkeypatch: pytest.MonkeyPatch) -> None:
