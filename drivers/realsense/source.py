@@ -83,7 +83,8 @@ class RealSenseSource(LiveSource):
 
     def _stream(self) -> RealSenseStream:
         rs, o = self._rs, self._options
-        device = find(rs)[choose(find(rs), self._serial)]
+        attached = find(rs)
+        device = attached[choose(attached, self._serial)]
         config, (width, height) = rs.config(), o.size
         config.enable_device(self._serial)
         for index in (1, 2):
