@@ -51,10 +51,9 @@ class VideoSource(BaseSource):
             yield image
             frame_id += 1
 
-    def _read(self, captures: list[cv2.VideoCapture], frame_id: int) -> StereoImage | None:
+    def _read(self, captures: list[Any], frame_id: int) -> StereoImage | None:
         """The next frame; None at the end."""
-        grabbed = [capture.grab() for capture in captures]  # all at once: cameras go on
-        if not all(grabbed):
+        if not self._grab(captures):
             return None
         found: list[U8] = []
         for capture in captures:
@@ -63,13 +62,19 @@ class VideoSource(BaseSource):
                 return None
             grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
             found.append(grey.astype(np.uint8, copy=False))
-        stamp_ns = self._stamp_ns(captures[0], frame_id)
+        stamp_ns, right_stamp_ns = self._stamps_ns(captures, frame_id)
         left, right = self._sides(found)
-        return StereoImage(frame_id, stamp_ns, left, right)
+        return StereoImage(frame_id, stamp_ns, left, right, right_stamp_ns=right_stamp_ns)
 
-    def _stamp_ns(self, capture: cv2.VideoCapture, frame_id: int) -> int:
-        """Of the frame that was read."""
-        return round(frame_id * 1e9 / self._fps if self._fps else capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+    def _grab(self, captures: list[Any]) -> bool:
+        """The next frames; False at the end."""
+        grabbed = [capture.grab() for capture in captures]  # all at once: cameras go on
+        return all(grabbed)
+
+    def _stamps_ns(self, captures: list[Any], frame_id: int) -> tuple[int, int]:
+        """Of the left and the right image that were read; 0: the right one has no stamp of its own."""
+        told_ns = captures[0].get(cv2.CAP_PROP_POS_MSEC) * 1e6
+        return round(frame_id * 1e9 / self._fps if self._fps else told_ns), 0
 
     def _sides(self, found: list[U8]) -> tuple[U8, U8 | None]:
         """Left and right images of a frame (or of one of each file)."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import cv2
@@ -53,6 +54,9 @@ class Capture:
         self.left, self.at = self.left - 1, self.at + 33.0
         return self.left >= 0
 
+    def getBackendName(self) -> str:
+        return "ANOTHER"
+
     def retrieve(self) -> tuple[bool, Any]:
         image = np.zeros((int(self.size[1]), int(self.size[0]), 3), np.uint8)
         image[:H, :W] = 10 + 100 * int(self.camera == 2)
@@ -62,6 +66,40 @@ class Capture:
 
     def release(self) -> None:
         return
+
+
+class Queued(Capture):
+    """V4L2: a started camera exposes every 33 ms, but fills no more than three buffers; the oldest comes first."""
+
+    sizes, now_ms = ((W, H),), 0.0
+    lost: Mapping[int, set[int]] = MappingProxyType({})  # exposures that never come, of each camera
+    clocks: Mapping[int, float] = MappingProxyType({})  # ms that a camera's clock is ahead
+    noise_ms = 0.0  # of every other stamp of camera 2
+
+    def __init__(self, camera: int, backend: int) -> None:
+        super().__init__(camera, backend)
+        self.number, self.next, self.waiting = camera, -1, list[float]()
+
+    def getBackendName(self) -> str:
+        return "V4L2"
+
+    def expose(self) -> None:
+        while (at := 33.0 * self.next) <= Queued.now_ms:
+            if len(self.waiting) < 3 and self.next not in self.lost.get(self.number, ()):
+                self.waiting.append(at)
+            self.next += 1
+
+    def grab(self) -> bool:
+        if self.next < 0:
+            self.next = round((Queued.now_ms + 300) / 33)
+        self.expose()
+        while not self.waiting:
+            Queued.now_ms += 1
+            self.expose()
+        exposed = self.waiting.pop(0)
+        noise_ms = self.noise_ms * (round(exposed / 33) % 2) * (self.number == 2)
+        self.at = 3.6e6 + exposed + noise_ms + self.clocks.get(self.number, 0.0)  # an hour after the start
+        return True
 
 
 @pytest.fixture
@@ -102,6 +140,83 @@ def test_a_lost_camera_is_opened_again(camera: type[Capture], monkeypatch: pytes
         monkeypatch.setattr(camera, "attached", False)
         with pytest.raises(DeviceLost, match="did not come back"):
             list(images)
+
+
+def skews(place: str, count: int, **given: object) -> list[float]:
+    """Right stamps less left ones, ms, of a tracker that takes 5 ms, and a second to start."""
+    with DRIVER.open(place, options(**given)) as source:
+        Queued.now_ms += 1000
+        found: list[float] = []
+        for image in islice(source, count):
+            found.append((image.right_stamp_ns - image.stamp_ns) / 1e6 if image.right_stamp_ns else np.nan)
+            Queued.now_ms += 5
+    return found
+
+
+@pytest.mark.parametrize("lost", [{}, {0: {100, 130}}, {2: {100, 101, 102}}, {0: {60}, 2: {90}}])
+@pytest.mark.parametrize("swap", [False, True])
+def test_two_cameras_are_paired_by_time(lost: dict[int, set[int]], swap: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though both were started one after the other, old frames wait, and some are lost."""
+    monkeypatch.setattr(cv2, "VideoCapture", Queued)
+    monkeypatch.setattr(Queued, "now_ms", 0.0)
+    monkeypatch.setattr(Queued, "lost", lost)
+    assert skews("0,2", 120, swap=swap) == [0.0] * 120
+
+
+def test_cameras_half_a_frame_apart_do_not_overtake_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", Queued)
+    monkeypatch.setattr(Queued, "now_ms", 0.0)
+    monkeypatch.setattr(Queued, "clocks", {2: 15.0})
+    monkeypatch.setattr(Queued, "noise_ms", 3.0)
+    monkeypatch.setattr(Queued, "lost", {0: {80}})
+    found = skews("0,2", 100)
+    assert set(found) == {15.0, 18.0, -18.0, -15.0}
+    assert np.count_nonzero(np.diff(np.sign(found))) == 1  # by the lost frame
+
+
+@pytest.mark.parametrize("clocks", [{2: 1e6}, {0: -1e9}])
+def test_clocks_that_differ_are_said_once(
+    clocks: dict[int, float], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Or one of them tells no time: then there is nothing to say."""
+    monkeypatch.setattr(cv2, "VideoCapture", Queued)
+    monkeypatch.setattr(Queued, "now_ms", 0.0)
+    monkeypatch.setattr(Queued, "clocks", clocks)
+    assert np.isnan(skews("0,2", 30)).all()
+    assert caplog.text.count("different clocks") == int(2 in clocks)
+
+
+def test_another_backend_tells_no_common_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", Queued)
+    monkeypatch.setattr(Queued, "getBackendName", lambda _: "FFMPEG")
+    assert np.isnan(skews("0,2", 10)).all()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_camera_without_images_is_not_waited_for_longer(
+    count: int, camera: type[Capture], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It opens, and gives nothing or one image: the time for it to come back goes on, with a pause between tries."""
+    now, asked, pauses = [0.0], list[int](), list[float]()
+
+    def monotonic() -> float:
+        asked.append(1)
+        assert len(asked) < 100
+        return now[0]
+
+    def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+        now[0] += seconds
+
+    with DRIVER.open("0", options(reconnect=1.0)) as source:
+        images = iter(source)
+        assert len(list(islice(images, 4))) == 4
+        clock = SimpleNamespace(monotonic=monotonic, sleep=sleep)
+        monkeypatch.setattr("stereo_sfm.drivers.uvc.source.time", clock)
+        monkeypatch.setattr(camera, "count", count)
+        with pytest.raises(DeviceLost, match="did not come back within 1 s"):
+            next(images)
+    assert 5 <= len(pauses) <= 6 and min(pauses) > 0
 
 
 def test_what_cannot_be_is_one_line(camera: type[Capture]) -> None:
