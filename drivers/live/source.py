@@ -29,7 +29,7 @@ class Segment(Protocol):
 
     pairs: Handoff[Pair]
     motion: MotionBuffer  # stamps of the camera's clock
-    clock: ClockMap  # known when the first pair is there
+    clock: ClockMap  # known when the first pair is there, and read again as the clocks drift
 
     def stop(self, camera_alive: bool = True) -> None:
         """Stop streaming; a responding camera gets the command."""

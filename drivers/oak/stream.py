@@ -96,7 +96,7 @@ class OakStream:
             self._counters.add("malformed")
             return
         with self._lock:
-            if side == LEFT and not self.clock.known:
+            if side == LEFT:
                 self._map_clock(frame)
             pair = self._pairer.push(side, image)
         if pair is not None:
@@ -115,7 +115,7 @@ class OakStream:
         return CameraImage(stamp, frame.getSequenceNum(), pixels, exposure_us, gain)
 
     def _map_clock(self, frame: Any) -> None:
-        """The clock offset from the first image: depthai maps its stamps to the host clock itself."""
+        """The clock offset from an image: depthai maps its stamps to the host clock itself."""
         middle = self._dai.CameraExposureOffset.MIDDLE
         host, camera = _nanoseconds(frame.getTimestamp(middle)), _nanoseconds(frame.getTimestampDevice(middle))
         # dai.Clock is the monotonic clock on Linux; the difference corrects for it elsewhere

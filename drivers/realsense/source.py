@@ -38,9 +38,7 @@ class RealSenseStream:
             while not self._stopping.is_set():
                 there, frame = self._queue.try_wait_for_frame(_WAIT_MS)
                 for pair in self._frames.take(frame) if there else []:
-                    if not self.clock.known:
-                        now = time.monotonic_ns()
-                        self.clock.add(now, pair.left.stamp_ns, now)
+                    self.clock.add_arrival(time.monotonic_ns(), pair.left.stamp_ns)
                     self.pairs.put(pair, weight=1 + pair.dropped_before)
         except RuntimeError as error:
             self.pairs.fail(device_error(error))

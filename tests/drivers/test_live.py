@@ -107,6 +107,34 @@ def test_one_time_line_over_two_segments() -> None:
     assert line.last == 701
 
 
+def test_stamps_go_on_after_a_day_in_which_the_clocks_drifted() -> None:
+    """The camera's clock is 30 ppm fast: 2.6 s. It restarts a second after its last image."""
+    line, first, second, third = TimeLine(), ClockMap(), ClockMap(), ClockMap()
+    host, day = 10**12, 86_400 * 10**9
+    first.add(host, 0, host)
+    line.begin_segment(first)
+    assert line.frame_stamp(0) == 0
+    camera = day + 30 * day // 10**6
+    first.add(host + day, camera, host + day)
+    assert line.frame_stamp(camera) == camera
+    for number, clock in enumerate((second, third), 1):
+        at = host + day + number * 10**9
+        clock.add(at, 500, at)
+        line.begin_segment(clock)
+        assert line.frame_stamp(500) == camera + number * 10**9
+
+
+def test_arrivals_tell_the_clock() -> None:
+    """Images come 20 ms late, some more; the camera's clock is 50 ppm fast, then slow."""
+    for ppm in (50, -50):
+        clock, rng = ClockMap(), np.random.default_rng(1)
+        for k in range(3000):
+            host = k * PERIOD
+            late = 20_000_000 + int(rng.integers(0, 200_000_000)) * (k % 10 > 0)
+            clock.add_arrival(host + late, host + host * ppm // 10**6)
+        assert clock.to_host(host + host * ppm // 10**6) == pytest.approx(host + 20_000_000, abs=100_000)
+
+
 def test_handoff_drops_the_oldest_and_returns_its_weight() -> None:
     queue: Handoff[str] = Handoff(2)
     assert queue.get(0.001) is None

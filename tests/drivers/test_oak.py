@@ -238,6 +238,22 @@ def test_pairs_by_number_and_time_through_real_queues() -> None:
     assert stream.clock.to_host(5_000_000_000) == pytest.approx(105e9 + shift, abs=5e6)
 
 
+def test_the_clock_is_read_with_each_left_image() -> None:
+    """depthai's own mapping follows the drift."""
+    left, right = (dai.MessageQueue(n, 8, True) for n in ("left", "right"))
+    stream, _ = stream_of(left, right)
+    for k, drift_s in enumerate((0.0, 0.5)):
+        sent = frame(1, k, 5 + k * PERIOD_S)
+        sent.setTimestamp(timedelta(seconds=5 + k * PERIOD_S + 100 + drift_s))
+        left.send(sent)
+        right.send(frame(2, k, 5 + k * PERIOD_S))
+    stream.start()
+    assert all(stream.pairs.get(2.0) is not None for _ in range(2))
+    stream.stop()
+    shift = time.monotonic_ns() - dai.Clock.now() / timedelta(microseconds=1) * 1000
+    assert stream.clock.to_host(5_000_000_000) == pytest.approx(105.5e9 + shift, abs=5e6)
+
+
 def test_a_closed_queue_is_a_lost_camera() -> None:
     left, right = (dai.MessageQueue(n, 8, True) for n in ("left", "right"))
     stream, _ = stream_of(left, right)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -15,6 +16,7 @@ from stereo_sfm.drivers.live.errors import DeviceFault, DeviceLost, NotFound
 from stereo_sfm.drivers.live.pairing import Pair
 from stereo_sfm.drivers.realsense import DRIVER, RealSenseOptions
 from stereo_sfm.drivers.realsense.frames import Frames
+from stereo_sfm.drivers.realsense.source import RealSenseStream
 from stereo_sfm.errors import StereoSfmError
 from tests.drivers.realsense_library import LEFT, PERIOD_MS, RIGHT, H, Library, W, frames
 
@@ -95,6 +97,15 @@ def test_the_hardware_clock_begins_again() -> None:
     system = [replace(left, clock="system", stamp_ms=left.stamp_ms + wrap_ms), replace(right, clock="system")]
     other = Frames(library, SIZE, counters, 0)
     assert not any(other.take(frame) for frame in system)  # another clock has no such end
+
+
+def test_the_clock_is_read_with_each_pair() -> None:
+    """The camera sends 0.2 s of images at once: its clock is ahead of what the first image told."""
+    library = Library(frames(20))
+    stream = RealSenseStream(library, library, Frames(library, SIZE, Counters(), 0), 30)
+    pairs = [got[0] for _ in range(20) if (got := stream.pairs.get(5.0)) is not None]
+    stream.stop()
+    assert len(pairs) == 20 and stream.clock.to_host(pairs[-1].left.stamp_ns) <= time.monotonic_ns()
 
 
 def test_a_camera_that_appears_between_two_searches(monkeypatch: pytest.MonkeyPatch) -> None:
