@@ -15,7 +15,7 @@ COUNTERS: dict[str, str] = {
     "implausible": "well-formed images rejected because counter and stamp contradict earlier frames",
     "half_frames": "image transfers that ended early or late",
     "malformed": "transfers and events that are not messages of the protocol",
-    "stalls": "times without an image for 500 ms",
+    "stalls": "times without an image for 500 ms, and for four periods of the camera",
     "disconnects": "times the camera disconnected or failed",
     "segments": "starts of streaming; more than 1 if the camera was restarted",
     "busy_retries": "commands repeated because the camera was busy",

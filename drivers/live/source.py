@@ -21,6 +21,7 @@ from stereo_sfm.types import ImuSamples, StereoImage
 logger = logging.getLogger("stereo_sfm")
 
 _RETRY_S = 0.2
+_STALL_PERIODS = 4  # without an image, at least: a slow camera that loses one has not stalled
 _QUIET_S = 1.0  # between two warnings about lost frames
 
 
@@ -40,8 +41,8 @@ class Segment(Protocol):
 class Patience:
     """Timeouts of a live source."""
 
-    stall_s: float = 0.5  # without an image: the camera has stalled
-    first_image_s: float = 3.0  # timeout of the first image of a segment
+    stall_s: float = 0.5  # without an image, and without several that were due: the camera has stalled
+    first_image_s: float = 3.0  # likewise for the first image of a segment
     reconnect_s: float = 20.0  # searching for a lost camera
 
 
@@ -136,7 +137,8 @@ class LiveSource(BaseSource):
     # ---- images
 
     def _next(self) -> tuple[Segment, Pair, int]:
-        wait = self._patience.stall_s if self._segment_frames else self._patience.first_image_s
+        least = self._patience.stall_s if self._segment_frames else self._patience.first_image_s
+        wait = max(least, _STALL_PERIODS * self._period_ns / 1e9)
         if self._segment is None:
             raise DeviceLost(f"the {self._title} source is closed")
         got = self._segment.pairs.get(wait)

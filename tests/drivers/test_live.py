@@ -15,6 +15,7 @@ from stereo_sfm.drivers.live.clock import ClockMap, TimeLine
 from stereo_sfm.drivers.live.counters import COUNTERS, Counters
 from stereo_sfm.drivers.live.errors import DeviceLost
 from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, ContinuityFilter, Pair, Pairer
+from stereo_sfm.drivers.live.source import LiveSource, Patience, Segment
 
 PERIOD = 33_333_333
 PIXELS = np.zeros((1, 1), np.uint8)
@@ -162,6 +163,47 @@ def test_samples_wait_for_their_image() -> None:
     rolled = wheel.take(5)
     assert rolled is not None and rolled.linear.tolist() == [[1, 0, 0]] and rolled.angular.tolist() == [[0, 0, 2]]
     assert wheel.take(9) is None
+
+
+class Waits(Handoff[Pair]):
+    """Never has a pair; keeps how long each was waited for."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.waits: list[float] = []
+
+    def get(self, timeout_s: float) -> tuple[Pair, int] | None:
+        self.waits.append(timeout_s)
+        raise KeyboardInterrupt
+
+
+class Silent(LiveSource):
+    """A camera that starts, and sends nothing."""
+
+    def __init__(self, rate_hz: float) -> None:
+        super().__init__("silent", "silent camera", round(1e9 / rate_hz), Patience(first_image_s=3.0))
+        self.pairs, self.motion, self.clock = Waits(), MotionBuffer(), ClockMap()
+
+    def _start(self) -> Segment:
+        return self
+
+    def _release(self) -> None: ...
+
+    def stop(self, camera_alive: bool = True) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "first_s", "later_s"), [(30, 3.0, 0.5), (8, 3.0, 0.5), (2, 3.0, 2.0), (1, 4.0, 4.0)]
+)
+def test_a_stall_is_several_periods_of_the_camera(rate_hz: float, first_s: float, later_s: float) -> None:
+    source = Silent(rate_hz)
+    for frames in (0, 1):
+        images = iter(source)
+        source._begin()
+        source._segment_frames = frames
+        with pytest.raises(KeyboardInterrupt):
+            next(images)
+    assert source.pairs.waits == [first_s, later_s]
 
 
 def test_counters_have_every_documented_name() -> None:
