@@ -10,15 +10,15 @@ from typing import TypeAlias
 
 import numpy as np
 
+from stereo_sfm.drivers.live.errors import DeviceFault
 from stereo_sfm.drivers.t265 import messages as m
 from stereo_sfm.drivers.t265.messages import Id, Sensor
-from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64
 
 Buffer: TypeAlias = bytes | bytearray | memoryview
 
 
-class ProtocolError(StereoSfmError):
+class ProtocolError(DeviceFault):
     """Bytes that are not the expected message."""
 
 

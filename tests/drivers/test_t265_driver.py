@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 
 import stereo_sfm.drivers.t265
 from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import (
     BootFailed,
     Busy,
@@ -31,10 +33,14 @@ from stereo_sfm.drivers.t265.acquire import Access
 from stereo_sfm.drivers.t265.camera import Settings
 from stereo_sfm.drivers.t265.firmware import verified
 from stereo_sfm.drivers.t265.messages import AntiFlicker, Id
+from stereo_sfm.drivers.t265.protocol import ProtocolError
 from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
 from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
 from stereo_sfm.drivers.t265.simulated.faults import Faults
 from stereo_sfm.drivers.t265.simulated.source import FAST, SimulatedT265Source, checked_firmware
+from stereo_sfm.drivers.t265.simulated.wire import reply
+from stereo_sfm.drivers.t265.source import T265Source
+from stereo_sfm.drivers.t265.stream import Stream
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 from tests.drivers.t265_rig import noise_content, open_camera, take
@@ -210,6 +216,31 @@ def test_a_persistent_stall_leads_to_a_reset() -> None:
     assert_honest(source, images)
     assert (source.counters["stalls"], source.counters["segments"]) == (2, 3)
     assert source.camera.generation == 3  # boot, reset, boot
+
+
+def test_a_malformed_answer_ends_no_session() -> None:
+    asked: list[int] = []
+
+    def malformed() -> int:
+        asked.append(1)
+        if len(asked) == 3:
+            stream._stopping.set()
+        raise ProtocolError("T265 answered 3 bytes, less than a header")
+
+    stream = Stream(SimpleNamespace(time_ns=malformed), Counters(), replace(FAST, clock_s=0.0), 3)
+    stream._guard(stream._keep_clock)
+    assert len(asked) == 3 and stream.pairs.get(0) is None  # which would raise an error of the thread
+
+
+@pytest.mark.parametrize("message", [Id.GET_DEVICE_INFO, Id.GET_CAMERA_INTRINSICS])
+def test_a_malformed_answer_at_the_start_closes_the_camera(message: Id, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = SimulatedCamera(noise_content(1))
+    camera.booted = True
+    bus, answer = SimulatedBus([camera]), camera._handle
+    monkeypatch.setattr(camera, "_handle", lambda got, body: reply(got, 0) if got == message else answer(got, body))
+    with pytest.raises(DeviceFault, match="has 0 bytes"):
+        T265Source(Access(bus, firmware=checked_firmware, timing=FAST), Settings(), Patience())
+    assert not bus._claimed
 
 
 def test_the_losses_of_a_slow_consumer_are_reported() -> None:
