@@ -20,6 +20,7 @@ from stereo_sfm.types import F64
 _BASELINE_M = (0.060, 0.068)
 _MAX_TILT_DEG = 2.0
 MIN_DENSITY = 1e-6  # a camera without known variances states 0
+_ROBOT_T_BODY = np.array([[0.0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # x forward, y left, z up
 
 
 def camera_model(intrinsics: CameraIntrinsics) -> KannalaBrandt:
@@ -43,6 +44,8 @@ def rig(
 ) -> Rig:
     """The stereo rig, checked: baseline 60 to 68 mm to the right, cameras parallel within 2 degrees.
 
+    Its body is the camera's, in the axes of robots.
+
     Raises:
         DeviceFault: the extrinsics are not those of a T265.
     """
@@ -53,7 +56,8 @@ def rig(
         raise DeviceFault(f"invalid factory extrinsics of the T265: right camera at {np.round(baseline * 1e3, 1)} mm")
     if tilt > _MAX_TILT_DEG:
         raise DeviceFault(f"invalid factory extrinsics of the T265: cameras {tilt:.1f} degrees from parallel")
-    return Rig(camera_model(left), camera_model(right), left_T_right, _rigid(body_T_left), name=name, serial=serial)
+    robot_T_left = _ROBOT_T_BODY @ _rigid(body_T_left)
+    return Rig(camera_model(left), camera_model(right), left_T_right, robot_T_left, name=name, serial=serial)
 
 
 def imu(body_T_left: F64, body_T_gyro: F64, gyro: MotionIntrinsics, accel: MotionIntrinsics) -> Imu:

@@ -81,7 +81,9 @@ def test_boot_calibration_and_the_order_of_commands() -> None:
         assert truth.right is not None and source.rig.right is not None
         for ours, theirs in ((source.rig.left, truth.left), (source.rig.right, truth.right)):
             np.testing.assert_allclose(ours.params[:8], theirs.params[:8], rtol=1e-6)
-        np.testing.assert_allclose(source.rig.body_T_left[:3, :3], np.diag([1, -1, -1]), atol=1e-7)
+        right_down_ahead = source.rig.body_T_left[:3, :3].T  # in the axes of robots: x forward, y left, z up
+        np.testing.assert_allclose(right_down_ahead, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-7)
+        np.testing.assert_allclose(source.rig.body_T_left[:3, 3], [0, 0.032, 0], atol=1e-3)
         assert source.rig.imu is not None
         imu = source.rig.imu.left_T_imu
         np.testing.assert_allclose(imu[:3, :3], np.diag([-1, -1, 1]), atol=1e-7)
