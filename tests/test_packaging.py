@@ -65,8 +65,9 @@ def test_the_launch_file_starts_the_service_with_a_valid_configuration() -> None
     text = (ROS2 / "launch" / "stereo_sfm.launch.py").read_text()
     ast.parse(text)
     assert '["stereo-sfm", "serve", "-c"' in text
-    service_config.load(ROS2 / "config" / "robot.toml")
-    yaml.safe_load((ROS2 / "config" / "nav2_params.yaml").read_text())
+    for folder in (ROS2 / "config", ROOT / "examples" / "ros2"):
+        service_config.load(folder / "robot.toml").pipeline()  # with the file of settings that it names
+        yaml.safe_load((folder / "nav2_params.yaml").read_text())
 
 
 def test_the_workflow_runs_the_same_script_on_every_python() -> None:

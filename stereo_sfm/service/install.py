@@ -134,10 +134,13 @@ def install(place: Place, writable: tuple[Path, ...] = ()) -> list[Path]:
     """Write the files and run the commands; the service is enabled, not started.
 
     Raises:
-        StereoSfmError: no root rights, no systemd, or a command failed.
+        StereoSfmError: no root rights, no systemd, a program that the service's user cannot reach, or a command failed.
     """
     todo = list(files(place, writable))
     _check_rights(place)
+    if place.root == Path("/"):
+        for program in (place.program, Path(sys.executable).resolve()):
+            check_reach(program, place.user)
     for path, text in todo:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
@@ -145,6 +148,13 @@ def install(place: Place, writable: tuple[Path, ...] = ()) -> list[Path]:
     for command in commands(place):
         _call(command, {9} if command[0] == "useradd" else set())  # 9: the user exists already
     return [path for path, _ in todo]
+
+
+def check_reach(program: Path, user: str) -> None:
+    """Raises StereoSfmError where another user may not enter a folder of a program, as those of home folders."""
+    closed = next((folder for folder in reversed(program.parents) if not folder.stat().st_mode & 0o001), None)
+    if closed is not None:
+        raise StereoSfmError(f"the user {user} may not enter {closed}: install stereo-sfm elsewhere, such as in /opt")
 
 
 def uninstall(place: Place) -> list[Path]:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm.cli import main
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service import install
 from stereo_sfm.service.config import load
 
@@ -40,6 +41,14 @@ def test_a_dry_run_prints_everything_and_changes_nothing(capsys: pytest.CaptureF
     for part in ("Type=notify", "useradd --system", "SUBSYSTEM", "[recording]", "systemctl enable stereo-sfm.service"):
         assert part in shown
     assert Path(install.UNIT_FILE).exists() == existed
+
+
+def test_a_program_in_a_home_folder_is_refused(tmp_path: Path) -> None:
+    """The unit would fail each second, without end."""
+    install.check_reach(Path("/usr/bin/env"), "robot")
+    (tmp_path / "home").mkdir(mode=0o700)
+    with pytest.raises(StereoSfmError, match="the user robot may not enter"):
+        install.check_reach(tmp_path / "home" / "stereo-sfm", "robot")
 
 
 def test_a_missing_installation_is_reported(
