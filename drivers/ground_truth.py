@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 
+from stereo_sfm.calib.formats.common import read_yaml, reading, rigid
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.input_file import read_text
@@ -97,6 +99,27 @@ def _never_turns(xyzw: F64) -> bool:
     return len(xyzw) > 1 and bool((xyzw[:, :3] == 0).all() and (xyzw[:, 3] == xyzw[0, 3]).all())
 
 
+def _order(path: Path, otherwise: tuple[int, ...]) -> tuple[int, ...]:
+    """Where x y z w of the quaternion stand, by the names of the columns in the first line if it has them.
+
+    Raises:
+        StereoSfmError: the columns are angles.
+    """
+    names = _names(path)
+    if {"roll", "pitch", "yaw"} <= {*names}:
+        raise StereoSfmError(f"{path} has angles instead of quaternions: write it in the TUM format")
+    found = [re.search(r"\bq(?:u[a-z]*)?(?:_[a-z]*)?[_. ]?([xyzw])$", name) for name in names]
+    axes = "".join(match[1] for match in found if match)
+    return tuple(map(axes.index, "xyzw")) if sorted(axes) == [*"wxyz"] else otherwise
+
+
+def _names(path: Path) -> list[str]:
+    """The cells of the first line in lower case, without units."""
+    line = read_text(path).partition("\n")[0].strip().lstrip("#").lower()
+    line = re.sub(r"\[[^]]*\]|\([^)]*\)", "", line)
+    return [cell.strip() for cell in (line.split(",") if "," in line else line.split())]
+
+
 def read_tum(path: Path) -> Trajectory:
     """`t tx ty tz qx qy qz qw`, seconds and metres; without a quaternion only positions."""
     rows = _rows(path, 8, alone=True)
@@ -104,20 +127,44 @@ def read_tum(path: Path) -> Trajectory:
         stamps = [stamp_from_seconds(r[0]) for r in rows]
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
-    return _trajectory(path, stamps, [r[1:8] for r in rows], _XYZW)
+    return _trajectory(path, stamps, [r[1:8] for r in rows], _order(path, _XYZW))
+
+
+def _read_two_stamps(path: Path) -> Trajectory:
+    """`s ns tx ty tz qx qy qz qw`: whole seconds and the nanoseconds after them."""
+    rows = _rows(path, 9)
+    try:
+        stamps = [_in_range(int(r[0]) * 10**9 + int(r[1]), r[0], "seconds") for r in rows]
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+    return _trajectory(path, stamps, [r[2:9] for r in rows], _order(path, _XYZW))
 
 
 def read_euroc(path: Path) -> Trajectory:
     """`t_ns, x, y, z, qw, qx, qy, qz, ...`: `state_groundtruth_estimate0`, `mocap0`, `vicon0` (the sensor's poses).
 
-    Without a quaternion, as in `leica0`, only positions.
+    Without a quaternion, as in `leica0`, only positions. The first line may name its columns in another order.
     """
     rows = _rows(path, 8, alone=True)
     try:
         stamps = [_in_range(int(r[0]), r[0], "nanoseconds") for r in rows]
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
-    return _trajectory(path, stamps, [r[1:8] for r in rows], _WXYZ)
+    return _trajectory(path, stamps, [r[1:8] for r in rows], _order(path, _WXYZ))
+
+
+def of_body(path: Path, poses: Trajectory) -> Trajectory:
+    """world_T_body of a sensor's poses in an ASL folder, by `T_BS` in the sensor.yaml beside them, if there is one.
+
+    Raises:
+        StereoSfmError: sensor.yaml is malformed.
+    """
+    file = path.with_name("sensor.yaml")
+    if not poses.oriented or not file.is_file():
+        return poses
+    with reading(file, "EuRoC"):
+        about = read_yaml(file)
+        return moved(poses, se3.inverse(rigid(about["T_BS"]["data"]))) if "T_BS" in about else poses
 
 
 def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
@@ -156,6 +203,8 @@ def read_trajectory(path: Path | str) -> Trajectory:
     path = Path(path).expanduser()
     if not has_stamps(path):
         return read_kitti(path)
+    if [name.rstrip("s") for name in _names(path)[:2]] == ["sec", "nsec"]:
+        return _read_two_stamps(path)
     first = _rows(path, 8, alone=True)[0]
     in_ns = len(first[0]) >= 15 or "[ns]" in read_text(path).partition("\n")[0]  # whose clock began at its start
     return read_euroc(path) if first[0].isdigit() and in_ns else read_tum(path)

@@ -9,17 +9,19 @@ from __future__ import annotations
 import logging
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from stereo_sfm.drivers.ground_truth import stamp_from_seconds
+from stereo_sfm.drivers.ground_truth import read_kitti, stamp_from_seconds
 from stereo_sfm.drivers.text_file import LAST_NS, nanoseconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import visible
 from stereo_sfm.pixels import SUFFIXES
+from stereo_sfm.types import Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -42,10 +44,11 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(files, key=natural_key)
 
 
-def natural_key(path: Path) -> tuple[tuple[int, str], ...]:
-    """Sort key that compares runs of digits as numbers."""
-    parts = [p for p in re.split(r"([0-9]+)", path.stem) if p]
-    return (*((int(p), "") if p[0] in "0123456789" else (-1, p) for p in parts), (-1, path.name))
+def natural_key(path: Path) -> tuple[tuple[Decimal, str], ...]:
+    """Sort key that compares runs of digits as numbers, those of seconds since 1970 with their decimals."""
+    parts = [p for p in re.split(r"([0-9]{10,}\.[0-9]+|[0-9]+)", path.stem) if p]
+    text = Decimal(-1)
+    return (*((Decimal(p), "") if p[0] in "0123456789" else (text, p) for p in parts), (text, path.name))
 
 
 def numbers_of(images: list[Path]) -> list[int] | None:
@@ -208,6 +211,28 @@ def lines_of(name: str, images: list[Path], lines: int, what: str, first: int | 
     places = {image: n - first for image, n in zip(images, numbers, strict=True) if n - first < lines}
     log.warning("%s: %d images and %d lines in %s, %d matched", name, len(images), lines, what, len(places))
     return places
+
+
+def truth_of_lines(
+    name: str, path: Path, images: list[Path], stamps: Mapping[Path, int], first: int | None = None
+) -> Trajectory | None:
+    """Poses in KITTI's format, a line for each image: those of the images by their numbers, as of `lines_of`.
+
+    None, with a warning, where the numbers do not tell the lines.
+
+    Args:
+        stamps: of the images.
+    """
+    poses = read_kitti(path).poses
+    try:
+        line = lines_of(name, images, len(poses), path.name, first)
+    except StereoSfmError as error:
+        log.warning("%s: there is no ground truth", error)
+        return None
+    used = [image for image in images if image in line and image in stamps]
+    if not used:
+        return None
+    return Trajectory(np.array([stamps[image] for image in used], np.int64), poses[[line[image] for image in used]])
 
 
 def frame_numbers(images: list[Path]) -> list[int]:

@@ -16,7 +16,7 @@ from stereo_sfm.calib.formats.euroc import read_euroc as read_rig
 from stereo_sfm.calib.formats.kalibr import read_kalibr
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, by_stamp, folder_of, need
-from stereo_sfm.drivers.ground_truth import moved, read_euroc
+from stereo_sfm.drivers.ground_truth import moved, of_body, read_euroc
 from stereo_sfm.drivers.image_lists import Listing, pair_listings
 from stereo_sfm.drivers.imu_table import read_imu_samples
 from stereo_sfm.drivers.options import SourceOptions
@@ -31,7 +31,7 @@ TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 def open_euroc(path: str, options: SourceOptions) -> FolderSource:
     """Open an ASL folder: the one that holds `mav0`, or `mav0` itself."""
     mav = _mav_folder(folder_of("euroc", path))
-    return _open(f"euroc:{_label(mav)}", mav, chosen_rig(options.rig, lambda: read_rig(mav)))
+    return _open(f"euroc:{_label(mav)}", mav, chosen_rig(options.rig, lambda: _own_rig(mav)))
 
 
 def open_tum_vi(path: str, options: SourceOptions) -> FolderSource:
@@ -40,6 +40,13 @@ def open_tum_vi(path: str, options: SourceOptions) -> FolderSource:
     chains = [mav.parent / "camchain.yaml", mav.parent / "dso" / "camchain.yaml"]
     chain = next((c for c in chains if c.is_file()), chains[0])
     return _open(f"tum_vi:{_label(mav)}", mav, chosen_rig(options.rig, lambda: read_kalibr(chain)))
+
+
+def _own_rig(mav: Path) -> Rig:
+    rig = read_rig(mav)
+    if not rig.stereo and (mav / "cam1" / "data.csv").is_file():
+        raise StereoSfmError(f"no {mav / 'cam1' / 'sensor.yaml'}: give a calibration of both cameras by --rig FILE")
+    return rig
 
 
 def _label(mav: Path) -> str:
@@ -99,4 +106,4 @@ def _read_exposures(path: Path) -> dict[str, float]:
 def _ground_truth(mav: Path, rig: Rig) -> Trajectory | None:
     """world_T_cam0 from the poses of the body."""
     path = next((p for p in (mav / f / "data.csv" for f in TRUTH_FOLDERS) if p.is_file()), None)
-    return None if path is None else moved(read_euroc(path), rig.body_T_left)
+    return None if path is None else moved(of_body(path, read_euroc(path)), rig.body_T_left)

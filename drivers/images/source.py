@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.side_names import LEFT_RIGHT, side_pairs, words_of
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of
-from stereo_sfm.drivers.ground_truth import read_trajectory
+from stereo_sfm.drivers.ground_truth import has_stamps, read_trajectory
 from stereo_sfm.drivers.image_lists import (
     frame_numbers,
     lines_of,
@@ -22,6 +22,7 @@ from stereo_sfm.drivers.image_lists import (
     natural_key,
     pair_files,
     stamps_of,
+    truth_of_lines,
 )
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.times_file import read_times
@@ -66,12 +67,10 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
         for (left, right), skew in zip(pairs, skews, strict=True)
     ]
     truth = next((folder / n for n in TRUTH_NAMES if (folder / n).is_file()), None)
-    source = FolderSource(
-        name,
-        chosen_rig(options.rig, lambda: _own_rig(folder)),
-        frames,
-        read_trajectory(truth) if truth is not None else None,
-    )
+    poses = None
+    if truth is not None:
+        poses = read_trajectory(truth) if has_stamps(truth) else truth_of_lines(name, truth, found[0], stamps)
+    source = FolderSource(name, chosen_rig(options.rig, lambda: _own_rig(folder)), frames, poses)
     if options.fps is None and not _stamped(folder, found[0]):
         source.assumed_hz = ASSUMED_FPS
     return source

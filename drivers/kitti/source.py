@@ -15,7 +15,7 @@ import numpy as np
 from stereo_sfm.calib.formats.kitti import read_kitti as read_rig
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import moved, read_kitti, stamp_from_seconds
-from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
+from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files, truth_of_lines
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
@@ -49,9 +49,11 @@ def open_kitti(path: str, options: KittiOptions) -> FolderSource:
     chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), pair=sides))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     truth = None
-    if truth_file.is_file():
-        truth = moved(read_kitti(truth_file, np.array(stamps, np.int64)), chosen.body_T_left)
-    return FolderSource(name, chosen, frames, truth)
+    if truth_file.is_file() and len(read_kitti(truth_file)) == len(stamps):
+        truth = read_kitti(truth_file, np.array(stamps, np.int64))
+    elif truth_file.is_file():  # of the whole sequence, where the images are a part
+        truth = truth_of_lines(name, truth_file, lefts, {left: stamps[k] for left, k in line.items()}, first=0)
+    return FolderSource(name, chosen, frames, None if truth is None else moved(truth, chosen.body_T_left))
 
 
 def _sequence_folder(folder: Path, sequence: str) -> Path:

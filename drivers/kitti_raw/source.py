@@ -114,10 +114,14 @@ def _imu_T_left(date: Path, cam0_T_left: F64) -> F64 | None:
 
 def _ground_truth(folder: Path, stamps: list[int], imu_T_left: F64) -> Trajectory | None:
     """world_T_left with the first IMU pose as the world, or None without oxts."""
-    packets = _packets(folder)[: len(stamps)]
-    if not len(packets):
+    packets, times = _packets(folder), folder / "oxts" / "timestamps.txt"
+    if len(packets) != len(stamps) and times.is_file():  # of a drive that is not synchronised: ten for each image
+        stamps = _read_times(times)
+    count = min(len(packets), len(stamps))
+    if not count:
         return None
-    return moved(Trajectory(np.array(stamps[: len(packets)], np.int64), poses_from_oxts(packets[:, :6])), imu_T_left)
+    at, first = np.unique(np.array(stamps[:count], np.int64), return_index=True)
+    return moved(Trajectory(at, poses_from_oxts(packets[:count, :6])[first]), imu_T_left)
 
 
 def _inertial(folder: Path) -> ImuSamples | None:

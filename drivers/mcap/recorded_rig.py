@@ -130,6 +130,12 @@ class RecordedRig:
         if not rows:
             return None
         rows.sort(key=lambda row: row.stamp_ns)
-        body_T_cam = chain(self._transforms(), rows[0].child, self._left_frame) if rows[0].child else None
+        body = rows[0].child
+        body_T_cam = chain(self._transforms(), body, self._left_frame) if body else None
+        if body_T_cam is None and (not body or body.lstrip("/") != self._left_frame.lstrip("/")):
+            log.warning(
+                "%s: no transform from the body of %s to the left camera: only errors of positions mean something",
+                self._reader.path, self._topics.truth,
+            )  # fmt: skip
         poses = np.array([row.matrix for row in rows]) @ (np.eye(4) if body_T_cam is None else body_T_cam)
         return Trajectory(np.array([row.stamp_ns for row in rows], np.int64), poses)

@@ -123,6 +123,8 @@ def _check_ranges(options: EvalOptions) -> None:
 
 def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, Trajectory]:
     """Estimate and reference, both with stamps and with poses of the same frame."""
+    from stereo_sfm.drivers.ground_truth import of_body
+
     file = estimate_file(path, which)
     reference, truth_file = (
         (own_truth(file.parent), None) if spec is None else load_reference(spec, _opening(file.parent))
@@ -133,8 +135,8 @@ def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, T
     frame, truth_frame = pose_frame(file), "cam0" if truth_file is None else pose_frame(truth_file)
     if (frame, truth_frame) == ("body", "cam0"):
         estimate = in_cam0(estimate, file)
-    elif (frame, truth_frame) == ("cam0", "body") and truth_file is not None:
-        reference = in_cam0(reference, truth_file)
+    elif (frame, truth_frame) == ("cam0", "body") and truth_file is not None and reference.oriented:
+        reference = in_cam0(of_body(truth_file, reference), truth_file, file.parent)
     return estimate, reference
 
 
@@ -212,11 +214,12 @@ def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
 
 def pose_frame(path: Path) -> str:
     """The frame of the poses in a file, "cam0" or "body", by its header or by its run; "" if unknown."""
+    from stereo_sfm.drivers.euroc.source import TRUTH_FOLDERS
     from stereo_sfm.export.trajectories import named_pose
 
     named = named_pose(path, "").removeprefix("world_T_")
-    if named:
-        return named
+    if named or (path.name == "data.csv" and path.parent.name in TRUTH_FOLDERS):
+        return named or "body"
     stats = path.parent / "stats.json"
     if path.suffix != ".kitti" or not stats.is_file():
         return ""
@@ -226,17 +229,21 @@ def pose_frame(path: Path) -> str:
         return ""
 
 
-def in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
-    """world_T_body -> world_T_cam0, each with its first pose as the world, by the calibration beside the file."""
+def in_cam0(bodies: Trajectory, path: Path, run: Path | None = None) -> Trajectory:
+    """world_T_body -> world_T_cam0, each with its first pose as the world, by the calibration beside the file.
+
+    Args: run, a folder with the calibration, where there is none beside it.
+    """
     from stereo_sfm.calib import load_rig
     from stereo_sfm.geometry import se3
     from stereo_sfm.types import Trajectory
 
-    if not (path.parent / "rig.yaml").is_file():
+    folders = [folder for folder in (path.parent, run) if folder is not None and (folder / "rig.yaml").is_file()]
+    if not folders:
         raise StereoSfmError(
             f"{path} holds poses of the body, and there is no rig.yaml beside it to convert them to cam0"
         )
-    body_T_cam = load_rig(path.parent / "rig.yaml").body_T_left
+    body_T_cam = load_rig(folders[0] / "rig.yaml").body_T_left
     return Trajectory(bodies.stamp_ns.copy(), se3.inverse(body_T_cam) @ bodies.poses @ body_T_cam, bodies.oriented)
 
 

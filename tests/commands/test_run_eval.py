@@ -111,6 +111,15 @@ def test_eval_of_body_poses(
     assert "poses of the body, and there is no rig.yaml" in capsys.readouterr().err
 
 
+def test_eval_with_the_datasets_own_file_of_the_body(
+    euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = data_root / "euroc_mh01"
+    truth = source / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    of_camera = ate(euroc_run, "--ref", source, capsys=capsys)
+    assert ate(euroc_run, "--ref", truth, capsys=capsys) == pytest.approx(of_camera, rel=1e-6)
+
+
 def test_eval_prints_the_runs_errors(
     euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from stereo_sfm.drivers.registry import recognise
 from stereo_sfm.drivers.select import SelectedFrames
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.recording.describe import describe_dataset
@@ -48,6 +50,24 @@ def test_kitti_root_and_sequence_folder_are_one_source(tmp_path: Path) -> None:
             assert source.rig.left_T_right[0, 3] == pytest.approx(0.5)
             assert source.ground_truth is not None
             assert source.ground_truth.positions[:, 2].tolist() == [0, 1, 2, 3]
+
+
+def test_kitti_from_its_middle(tmp_path: Path) -> None:
+    """Poses of the whole sequence belong to the images by their numbers, whatever times there are."""
+    root = make_kitti(tmp_path, frames=10)
+    sequence = root / "sequences" / "00"
+    for path in sequence.glob("image_?/00000[0-5].png"):
+        path.unlink()
+    for times in ((sequence / "times.txt").read_text(), "".join(f"{k * 0.1:.6e}\n" for k in range(4)), None):
+        (sequence / "times.txt").unlink()
+        if times is not None:
+            (sequence / "times.txt").write_text(times)
+        with open_source(root) as source:
+            truth, stamps = source.ground_truth, [image.stamp_ns for image in source]
+        assert truth is not None
+        rows = np.searchsorted(truth.stamp_ns, stamps)
+        assert truth.positions[rows, 2].tolist() == [6, 7, 8, 9]
+        (sequence / "times.txt").touch()
 
 
 @pytest.mark.parametrize("make", [make_kitti, make_kitti_raw])
@@ -95,6 +115,73 @@ def test_kitti_raw_drive_with_poses_from_gps(tmp_path: Path) -> None:
             # World: the first IMU's, x forward. The camera looks along it.
             assert truth.positions == pytest.approx(np.outer(range(4), [1, 0, 0]), abs=1e-4)
             assert truth.poses[0][:3, 2] == pytest.approx([1, 0, 0])
+
+
+def test_a_drive_that_is_not_synchronised_has_poses_of_their_own_times(tmp_path: Path) -> None:
+    """Ten packets for each image; the car moves by a metre a packet."""
+    root = make_kitti_raw(tmp_path)
+    drive = root / "2011_09_26_drive_0001_sync"
+    metre = 180 / np.pi / 6378137.0 / np.cos(np.radians(49.0))
+    for k in range(31):
+        text = f"49.0 {8.4 + k * metre:.12f} 100 0 0 0 " + "0 " * 24
+        (drive / "oxts" / "data" / f"{k:010d}.txt").write_text(text)
+    times = [f"2011-09-26 13:02:25.{k:02d}0000001\n" for k in range(31)]
+    (drive / "oxts" / "timestamps.txt").write_text("".join(times))
+    with open_source(root) as source:
+        truth, stamps = source.ground_truth, [image.stamp_ns for image in source]
+    assert truth is not None and len(truth) == 31
+    assert truth.positions[np.searchsorted(truth.stamp_ns, stamps), 0] == pytest.approx([0, 10, 20, 30], abs=1e-3)
+
+
+def test_images_named_by_seconds_without_zeros_are_in_order(tmp_path: Path) -> None:
+    """As Python writes them: ...79.1 is after ...79.05, and before ...79.15."""
+    names = [f"{1403636579 + round(0.05 * k, 2)}.png" for k in range(12)]
+    with open_source(make_images(tmp_path, names)) as source:
+        images = list(source)
+    assert [image.stamp_ns for image in images] == [1403636579 * 10**9 + 50_000_000 * k for k in range(12)]
+    for k, image in enumerate(images):
+        np.testing.assert_array_equal(image.left, picture(k, 0))
+
+
+def test_poses_without_stamps_beside_images_belong_to_them_in_order(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_images(tmp_path)
+    (root / "poses.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {k}\n" for k in range(12)))
+    with open_source(root) as source:
+        truth, stamps = source.ground_truth, [image.stamp_ns for image in source]
+    assert truth is not None and truth.stamp_ns.tolist() == stamps
+    (root / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 7)
+    for side in ("left", "right"):
+        for path in (root / side).iterdir():
+            path.rename(path.with_name(f"{int(path.stem) + 40}.png"))
+    with open_source(root) as source:
+        assert source.ground_truth is None and "there is no ground truth" in caplog.text
+
+
+def test_a_second_camera_without_calibration_is_said(tmp_path: Path) -> None:
+    root = make_euroc(tmp_path)
+    (root / "mav0" / "cam1" / "sensor.yaml").unlink()
+    with pytest.raises(StereoSfmError, match=r"cam1.sensor\.yaml: give a calibration of both cameras"):
+        open_source(root)
+
+
+def test_poses_of_a_marker_are_those_of_the_body(tmp_path: Path) -> None:
+    root = make_euroc(tmp_path)
+    listed = root / "mav0" / "state_groundtruth_estimate0" / "data.csv"
+    listed.write_text(listed.read_text().replace("1,0,0,0", "0.6,0,0.8,0", 1))  # else it never turns
+    with open_source(root) as source:
+        truth = source.ground_truth
+    folder = (root / "mav0" / "state_groundtruth_estimate0").rename(root / "mav0" / "vicon0")
+    marker = "[0, -1, 0, 0.3, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
+    (folder / "sensor.yaml").write_text(f"T_BS: {{cols: 4, rows: 4, data: {marker}}}\n")
+    with open_source(root) as source:
+        moved = source.ground_truth
+    body_T_marker = np.array(json.loads(marker), float).reshape(4, 4)
+    body_T_left = source.rig.body_T_left
+    assert truth is not None and moved is not None
+    expected = truth.poses @ se3.inverse(body_T_left) @ se3.inverse(body_T_marker) @ body_T_left
+    np.testing.assert_allclose(moved.poses, expected, atol=1e-9)
 
 
 def test_kitti_raw_inertial_samples(tmp_path: Path) -> None:

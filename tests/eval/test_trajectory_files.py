@@ -125,3 +125,34 @@ def test_the_position_tracker_of_euroc(tmp_path: Path) -> None:
     truth = read_trajectory(tmp_path / "data.csv")
     assert not truth.oriented and truth.positions.tolist() == [[1, 2, 3], [2, 2, 3]]
     assert truth.stamp_ns[0] == 1403636579763555584
+
+
+@pytest.mark.parametrize(
+    ("header", "stamp", "order"),
+    [
+        ("# frame_id, t_x, t_y, t_z, quaternion_x, quaternion_y, quaternion_z, quaternion_w, scale", "{ns}", "xyzw"),
+        ("timestamp,x,y,z,qw,qx,qy,qz", "{s}.{left:09d}", "wxyz"),
+        ("#sec,nsec,x,y,z,qx,qy,qz,qw", "{s},{left}", "xyzw"),
+        ("#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
+         "{ns}", "wxyz"),
+    ],
+)  # fmt: skip
+def test_columns_are_those_that_the_first_line_names(
+    header: str, stamp: str, order: str, trajectory: Trajectory, tmp_path: Path
+) -> None:
+    """Positions and stamps alone do not tell: errors of rotation and of motions between frames do."""
+    lines = [header]
+    for stamp_ns, pose in zip(trajectory.stamp_ns.tolist(), trajectory.poses, strict=True):
+        xyzw = dict(zip("xyzw", se3.quaternion_from_rotation(pose[:3, :3]).tolist(), strict=True))
+        at = stamp.format(ns=stamp_ns, s=stamp_ns // 10**9, left=stamp_ns % 10**9)
+        lines.append(",".join([at, *map(str, pose[:3, 3]), *(str(xyzw[axis]) for axis in order), "1"]))
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    read = read_trajectory(tmp_path / "t.csv")
+    assert read.stamp_ns.tolist() == trajectory.stamp_ns.tolist()
+    assert read.poses == pytest.approx(trajectory.poses, abs=1e-8)
+
+
+def test_angles_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("timestamp,x,y,z,roll,pitch,yaw,speed\n0.1,1,2,3,0.1,0.2,0.3,4\n")
+    with pytest.raises(StereoSfmError, match="angles instead of quaternions"):
+        read_trajectory(tmp_path / "t.csv")
