@@ -79,7 +79,7 @@ def test_a_folder_of_another_store_becomes_this_one(place: str, tmp_path: Path) 
         publish_night(Remote.of(place) / name, tmp_path / name, night)
         fetch_released(Remote.of(place) / name, "", robot)
         assert content(robot) == content(tmp_path / name)
-    with pytest.raises(objects.Missing):
+    with pytest.raises(StereoSfmError, match=r"no map at .*/nowhere"):
         fetch_released(Remote.of(place) / "nowhere", "", robot)
     store = Remote.of(place) / "there"
     objects.delete(store / name for name, _, _ in objects.listed(store))
