@@ -5,6 +5,9 @@ And what the tracker does when the map corrects its rig.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -18,10 +21,12 @@ from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.factory import make_tracker
+from stereo_sfm.tracking.flow.keyframes import Keyframes
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
-from stereo_sfm.tracking.flow.sudden_turn import SUSPECTED, SuddenTurns
+from stereo_sfm.tracking.flow.sudden_turn import DECIDED, SUSPECTED, SuddenTurns
+from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.tracking.flow.tracks import Tracks
-from stereo_sfm.types import F64, StereoImage, TrackState, Trajectory
+from stereo_sfm.types import F64, MapUpdate, StereoImage, TrackState, Trajectory, no_ids
 from tests.synthetic import fisheye_rig, pinhole_rig, turned
 
 RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
@@ -57,6 +62,26 @@ class Sequence:
         changed = self.turns.seen(self.last, np.eye(4), image, np.eye(4) if pose is None else pose, cameras)
         self.last = image
         return changed
+
+
+def test_a_turn_that_the_mapper_refuses_is_given_up() -> None:
+    """Else odometry goes on with a rig that is wrong, and without the map, to the end of the run."""
+    turns, keyframes, tracker = SuddenTurns(), object.__new__(Keyframes), object.__new__(Tracker)
+    turns.turn = np.array([0.002, 0.0, 0.0])
+    assert "corrected if it stays so" in turns.news()
+    own: Any = keyframes
+    own._turn, own._turned_kf_id, own._first_of_rig = turns.turn, 10, 0
+    own, used = tracker, list[str]()
+    own._sudden, own._keyframes, own._sensors, own._tracks = turns, keyframes, None, Tracks()
+    own._pose, own._velocity, own._resumed_T_odom = np.eye(4), np.zeros(6), np.eye(4)
+    own._new_points = SimpleNamespace(triangulate_again=lambda *_: used.append("points"))
+    own._use_rig = lambda: used.append("rig")
+    for kf_id in range(10, 10 + DECIDED):
+        tracker.apply(MapUpdate(kf_id, kf_id, no_ids(), np.zeros((0, 4, 4))))
+        assert turns.turn.any() and not used
+    tracker.apply(MapUpdate(20, 10 + DECIDED, no_ids(), np.zeros((0, 4, 4))))
+    assert not turns.turn.any() and used == ["rig", "points"]
+    assert "did not stay so" in turns.news()
 
 
 @pytest.mark.parametrize("name", RIGS)

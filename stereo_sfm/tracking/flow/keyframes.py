@@ -69,6 +69,8 @@ class Keyframes:
         self._frames_since = 0
         self._doubt: F64 = np.zeros(2)  # since the newest keyframe
         self._stamp_ns, self._submap_id = 0, -1  # of the newest keyframe
+        self._turn: F64 = np.zeros(3)  # of the right camera, that the newest one was tracked with ...
+        self._turned_kf_id = 0  # ... and the first one with it
         self._first_of_rig = 0  # id of the first keyframe of the current rig
 
     def use(self, rig: Rig) -> None:
@@ -134,9 +136,15 @@ class Keyframes:
             **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )
         self._stamp_ns, self._submap_id = image.stamp_ns, submap_id
+        if sudden is not None and not np.array_equal(sudden.turn, self._turn):
+            self._turn, self._turned_kf_id = sudden.turn, keyframe.kf_id
         self.count, self._frames_since, self._doubt = self.count + 1, 0, np.zeros(2)
         self._pose, self._covariance = odom_T_cam.copy(), covariance.copy()
         return keyframe
+
+    def shown(self, turn: F64, kf_id: int) -> int:
+        """How many keyframes up to one were tracked with a turn (3,) of the right camera, if the newest one was."""
+        return kf_id - self._turned_kf_id + 1 if np.array_equal(turn, self._turn) else 0
 
     def _moved(self, odom_T_cam: F64, covariance: F64) -> MotionLink:
         """The motion from the newest keyframe to a pose (4, 4) with covariance (6, 6)."""

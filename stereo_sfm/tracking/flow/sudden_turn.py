@@ -37,6 +37,7 @@ SUSPECTED = "the right camera seems to have turned suddenly"  # how what is susp
 # that counts for: a few, so that nothing is sudden while the sequence is new.
 USUAL, USUAL_IMAGES = 2e-4, 4.0
 REMEMBERED_IMAGES = 100.0  # after which what was usual is forgotten
+DECIDED = 8  # keyframes that show it, in which the mapper corrects the rig or never will: twice those that it compares
 FOLLOWED_SIGMAS = 3.0  # of what the camera turns by after it, within which it stays
 
 
@@ -124,6 +125,10 @@ class SuddenTurns:
             return f"{SUSPECTED}, but did not stay so: the calibration is not changed"
         degrees = np.rad2deg(np.linalg.norm(self.turn))
         return f"{SUSPECTED}, by {degrees:.2f} degrees: the calibration is corrected if it stays so"
+
+    def refused(self) -> None:
+        """The mapper's keyframes are better explained by the rig as it was."""
+        self._forget()
 
     def confirmed(self, turn: F64) -> None:
         """The rig has been corrected by a rotation (3,)."""

@@ -40,7 +40,7 @@ from stereo_sfm.tracking.flow.rolling_shutter import MIN_INTERVAL_S, RollingShut
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
-from stereo_sfm.tracking.flow.sudden_turn import SuddenTurns
+from stereo_sfm.tracking.flow.sudden_turn import DECIDED, SuddenTurns
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
@@ -133,7 +133,11 @@ class Tracker:
             self._rig_terms = update.calibration.terms
             self._use_rig()
             self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
-        elif self._turn.any():  # the map does not know it yet
+        elif self._sudden is not None and self._turn.any():  # the map does not know it yet
+            if self._keyframes.shown(self._turn, update.kf_id) > DECIDED:
+                self._sudden.refused()
+                self._use_rig()
+                self._new_points.triangulate_again(self._tracks, self._pose, self._velocity)
             update = replace(update, point_ids=update.point_ids[:0], points_map=update.points_map[:0])
         self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
         if corrected and not self._loss.frames:
