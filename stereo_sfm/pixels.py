@@ -142,7 +142,7 @@ class BitsSoFar:
 
     def including(self, images: Sequence[U8 | U16]) -> int:
         """Bits for `eight_bits`, of these images and those before; those of eight bits do not count."""
-        deep = [image for image in images if image.dtype == np.uint16]
+        deep: list[Any] = [image for image in images if image.dtype == np.uint16]
         bits = max(sensor_bits(deep), self._bits) if deep else self._bits
         if bits != self._bits:
             log.warning("16-bit images: the values use %d bits, %d is taken as white", bits, 2**bits - 1)

@@ -84,10 +84,9 @@ class SensorCalibration:
         """Add a keyframe; returns what is new. `version`: of the map update that brings it."""
         if keyframe.samples is None or not len(keyframe.samples.stamp_ns):
             return None
-        if keyframe.submap_id != self._submap_id:  # the next poses do not go with those until then
+        if keyframe.submap_id != self._submap_id:  # its poses do not go with those before
             self._parts.clear()
             self._submap_id = keyframe.submap_id
-            return None
         if not self._parts:
             self._due_ns = keyframe.stamp_ns + round(FIRST_S * 1e9)
         self._parts.append(keyframe.samples)

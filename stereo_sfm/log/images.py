@@ -164,7 +164,8 @@ def decode_depth(data: bytes, width: int, height: int, step: int, encoding: str)
 def without_mosaic(pixels: U8 | U16, encoding: str) -> U8 | U16:
     """(H, W) grey of the pixels behind a colour filter; as they are if the encoding is not one of those (bayer_...)."""
     conversion = _ENCODINGS[encoding][2] if encoding.startswith("bayer_") and encoding in _ENCODINGS else None
-    return pixels if conversion is None else cv2.cvtColor(pixels, conversion).astype(pixels.dtype, copy=False)
+    grey: Any = pixels if conversion is None else cv2.cvtColor(pixels, conversion)
+    return grey.astype(pixels.dtype, copy=False)
 
 
 def decode_depth_file(data: bytes, inverse: tuple[float, float] | None = None) -> F32:

@@ -25,6 +25,7 @@ from pathlib import Path
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
+from stereo_sfm.input_file import read_text
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.folders import MapFolders, map_sha256
 from stereo_sfm.maps.growing import GrowingMap
@@ -157,7 +158,7 @@ class MapStore:
     def _is_as_left(self) -> bool:
         """Whether the saved map is what was written last, or what the unfinished session began with."""
         try:
-            left = _saved_file(self.folder).read_text(encoding="utf-8")
+            left = read_text(_saved_file(self.folder))
         except FileNotFoundError:  # nothing was joined
             left = _checksum(self._base_folder)
         return _checksum(self.folder) == left

@@ -103,7 +103,7 @@ def test_poses_of_two_submaps_are_not_compared() -> None:
 
 
 def test_after_a_minute_without_a_keyframe_it_begins_anew() -> None:
-    calibration, moved = SensorCalibration(drive(0).rig), np.eye(4)[None].repeat(2, axis=0)
+    calibration, moved = SensorCalibration(drive(0).source.rig), np.eye(4)[None].repeat(2, axis=0)
     for n, stamps in enumerate(((1, 2), (3, 80), (81, 82))):
         samples = SensorSamples(np.array(stamps) * 10**9, moved, None, None)
         assert calibration.add(keyframe(n, stamps[1] * 10**9, np.eye(4), samples), n) is None
