@@ -106,10 +106,10 @@ def _order(path: Path, otherwise: tuple[int, ...]) -> tuple[int, ...]:
         StereoSfmError: the columns are angles.
     """
     names = _names(path)
-    if {"roll", "pitch", "yaw"} <= {*names}:
-        raise StereoSfmError(f"{path} has angles instead of quaternions: write it in the TUM format")
     found = [re.search(r"\bq(?:u[a-z]*)?(?:_[a-z]*)?[_. ]?([xyzw])$", name) for name in names]
     axes = "".join(match[1] for match in found if match)
+    if not axes and {"roll", "pitch", "yaw"} <= {*names}:
+        raise StereoSfmError(f"{path} has angles instead of quaternions: write it in the TUM format")
     return tuple(map(axes.index, "xyzw")) if sorted(axes) == [*"wxyz"] else otherwise
 
 

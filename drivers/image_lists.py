@@ -46,7 +46,7 @@ def list_images(folder: Path) -> list[Path]:
 
 def natural_key(path: Path) -> tuple[tuple[Decimal, str], ...]:
     """Sort key that compares runs of digits as numbers, those of seconds since 1970 with their decimals."""
-    parts = [p for p in re.split(r"([0-9]{10,}\.[0-9]+|[0-9]+)", path.stem) if p]
+    parts = [p for p in re.split(r"((?<![0-9])[0-9]{10}\.[0-9]+|[0-9]+)", path.stem) if p]
     text = Decimal(-1)
     return (*((Decimal(p), "") if p[0] in "0123456789" else (text, p) for p in parts), (text, path.name))
 

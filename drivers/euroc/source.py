@@ -9,6 +9,7 @@ sixteen-bit images carry the sensor's twelve bits in their upper part.
 from __future__ import annotations
 
 import csv
+import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.text_file import read_text, stamp_ns
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import ImuSamples, Trajectory
+
+log = logging.getLogger("stereo_sfm")
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
@@ -106,4 +109,11 @@ def _read_exposures(path: Path) -> dict[str, float]:
 def _ground_truth(mav: Path, rig: Rig) -> Trajectory | None:
     """world_T_cam0 from the poses of the body."""
     path = next((p for p in (mav / f / "data.csv" for f in TRUTH_FOLDERS) if p.is_file()), None)
-    return None if path is None else moved(of_body(path, read_euroc(path)), rig.body_T_left)
+    if path is None:
+        return None
+    poses = read_euroc(path)
+    try:
+        poses = of_body(path, poses)
+    except StereoSfmError as error:
+        log.warning("%s: its poses are taken for those of the body", error)
+    return moved(poses, rig.body_T_left)

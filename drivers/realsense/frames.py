@@ -33,7 +33,8 @@ class Frames:
         self, rs: Any, size: tuple[int, int], counters: Counters, period_ns: int, alternate: bool = False
     ) -> None:
         self._rs, self._size, self._counters = rs, size, counters
-        self._pairer = Pairer(counters, period_ns)
+        self._period_ns, self._step = period_ns, 1  # from the number of an image that is passed on to the next
+        self._pairer: Pairer | None = None
         self._alternate, self._clock, self._other_clock = alternate, "", False
         self._newest_ns: int | None = None  # stamp of the hardware clock, of an image or a sample
         self.motion = MotionBuffer()
@@ -48,6 +49,10 @@ class Frames:
         profile = frame.get_profile()
         if profile.stream_type() != self._rs.stream.infrared or self._emitter_is_on(frame):
             return []
+        if self._pairer is None:
+            tells = not self._alternate or not math.isnan(self._metadata(frame, "frame_laser_power_mode", math.nan))
+            self._step = 2 if self._alternate and tells else 1
+            self._pairer = Pairer(self._counters, self._period_ns if tells else 0)  # else those with dots come, too
         image = self._image(frame)
         if image is None:
             self._counters.add("malformed")
@@ -69,7 +74,7 @@ class Frames:
         self._clock = str(frame.get_frame_timestamp_domain())
         exposure_us = self._metadata(frame, "actual_exposure", 0.0)
         gain = self._metadata(frame, "gain_level", _GAIN_ONE) / _GAIN_ONE
-        number = frame.get_frame_number() // (2 if self._alternate else 1)  # every other one has dots
+        number = frame.get_frame_number() // self._step
         return CameraImage(self._stamp_ns(frame), number, pixels, exposure_us, gain)
 
     def _stamp_ns(self, frame: Any) -> int:

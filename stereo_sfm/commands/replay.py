@@ -115,7 +115,7 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
     """The run of a log as options."""
     from stereo_sfm.commands._execute import RunOptions
     from stereo_sfm.drivers.choice import ReplayChoice
-    from stereo_sfm.drivers.source import is_device
+    from stereo_sfm.drivers.source import is_device, path_of
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.log.reader import LogReader
 
@@ -132,7 +132,7 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
     follow = options.schedule == "recorded" or (options.schedule is None and before.mode == "realtime")
     logged = options.source is None and before.image_format != "none"  # the images that the tracker saw
     spec = str(path) if logged else options.source or before.source
-    if not logged and is_device(spec):
+    if not logged and is_device(spec) and not path_of(spec).is_file():
         raise StereoSfmError(f"{path} has no images, and its source {spec} is a camera: run it with --log full")
     rig, rectify = (None, "none") if logged else (before.opening.rig, before.opening.rectify)
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], options.until))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from stereo_sfm.calib.rectification import PROJECTIONS
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.rectified import rectified
-from stereo_sfm.drivers.source import Source, open_source
+from stereo_sfm.drivers.source import Source, open_source, path_of
 from stereo_sfm.drivers.start_checked import StartCheckedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
@@ -28,20 +29,20 @@ def open_recording(
         spec: the recording.
         cameras: of the map; as it was calibrated, or as corrected.
         own_rig: calibration that replaces the recording's own.
-        run: folder of the run that made the map; what its first images said holds here, too.
+        run: folder of the run that made the map; its images are paired as it paired them.
 
     Raises:
         StereoSfmError: it was recorded with another camera.
     """
-    source, check = open_source(spec, own_rig), None if run is None else _start_check(run, spec)
+    source = open_source(spec, own_rig)
     for how in PROJECTIONS:
         try:
             seen = rectified(source, how)
         except StereoSfmError:  # one camera, or two that cannot be rectified this way
             continue
-        seen = seen if check is None else StartCheckedSource(seen, False, check)
         if not all(difference(rig, seen.rig, corrected=True) for c in cameras for rig in (c.calibrated, c.rig)):
-            return seen
+            check = None if run is None else _start_check(run, spec)
+            return seen if check is None else StartCheckedSource(seen, False, replace(check, rig=""))
     other = difference(cameras[-1].rig, source.rig)
     raise StereoSfmError(
         f"the camera of {spec} is not the map's, rectified or not (it has {other}): give"
@@ -50,15 +51,18 @@ def open_recording(
 
 
 def _start_check(run: Path, spec: str) -> StartCheck | None:
-    """What the first images of a run said; None for those of its own log, which are paired and calibrated by that."""
+    """What the first images of a run said, if this is the source that it read, and not its log, which is paired."""
+    from stereo_sfm.log import topics
+    from stereo_sfm.log.provenance import METADATA
     from stereo_sfm.log.reader import LogReader
-    from stereo_sfm.log.recorded import read_run
+    from stereo_sfm.log.recorded import messages
 
-    log = run / "run.mcap"
-    if not log.is_file() or Path(spec).absolute() == log.absolute():
+    if not (run / "run.mcap").is_file():
         return None
-    with LogReader(log) as reader:
-        return read_run(reader).start_check
+    with LogReader(run / "run.mcap") as reader:
+        if path_of(reader.metadata(METADATA).get("source", "")).resolve() != path_of(spec).resolve():
+            return None
+        return next((found for _, found in messages(reader, (topics.START_CHECK,))), None)
 
 
 def check_session(saved: SavedMap, session: int | None) -> None:

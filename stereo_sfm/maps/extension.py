@@ -58,8 +58,7 @@ class Extension(Mapper):
             self._localizer.relocalize()  # what it expects is of the last time that it was asked
         if self._misplaced or keyframe.submap_id != self._submap_id:
             place, found = self._localizer.step(keyframe), self._localizer.last
-            if found is not None and found.found:
-                self._join_submaps(keyframe, found)
+            if found is not None and found.found and self._join_submaps(keyframe, found):
                 update = dataclasses.replace(update, map_T_odom=self._map_T_odom.copy())
                 self._found, self._found_kf = found, (keyframe.kf_id, np.eye(4))
                 self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
@@ -109,15 +108,23 @@ class Extension(Mapper):
         self._saved_T_session = se3.orthonormalize(self._found.map_T_cam @ se3.inverse(session_T_cam))
         return self._with_everything(update)
 
-    def _join_submaps(self, keyframe: Keyframe, found: Location) -> None:
-        """The saved map shows how the newest keyframe lies to the one that was relocalized in another submap."""
+    def _join_submaps(self, keyframe: Keyframe, found: Location) -> bool:
+        """The saved map shows how the newest keyframe lies to the one that was relocalized in another submap.
+
+        Returns:
+            False where the session's own map contradicts that: the place only looks alike.
+        """
         if self._found is None or keyframe.submap_id == self._submap_id:
-            return
+            return True
         kf_id, living_T_kf = self._found_kf
         living_T_cam = living_T_kf @ se3.inverse(self._found.map_T_cam) @ found.map_T_cam
         self._close(
             LoopResult(keyframe.kf_id, kf_id, living_T_cam, found.information, no_ids(0, 2), found.inliers, 0.0, "")
         )
+        refused, self._refused = bool(self._refused), []  # no result of the loop closer
+        if refused:
+            self._localizer.relocalize()
+        return not refused
 
     def _follow_found(self) -> None:
         """Where the relocalized keyframe was culled, the keyframe that carries it stands for it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import shutil
 import subprocess
 import sys
@@ -152,7 +153,19 @@ def install(place: Place, writable: tuple[Path, ...] = ()) -> list[Path]:
 
 def check_reach(program: Path, user: str) -> None:
     """Raises StereoSfmError where another user may not enter a folder of a program, as those of home folders."""
-    closed = next((folder for folder in reversed(program.parents) if not folder.stat().st_mode & 0o001), None)
+    try:
+        known = pwd.getpwnam(user)
+    except KeyError:  # it is made later, and owns nothing
+        uid, groups = -1, list[int]()
+    else:
+        uid, groups = known.pw_uid, os.getgrouplist(user, known.pw_gid)
+
+    def enters(folder: Path) -> bool:
+        about = folder.stat()
+        bit = 0o100 if about.st_uid == uid else 0o010 if about.st_gid in groups else 0o001
+        return uid == 0 or bool(about.st_mode & bit)
+
+    closed = next((folder for folder in reversed(program.parents) if not enters(folder)), None)
     if closed is not None:
         raise StereoSfmError(f"the user {user} may not enter {closed}: install stereo-sfm elsewhere, such as in /opt")
 

@@ -143,6 +143,7 @@ class MapStore:
             self.saved_ns = max(self.saved_ns, (self.folder / "map.json").stat().st_mtime_ns)
             copy_map(self.folder, base)
             self._base = base
+        _remember(self.folder)
         return MapFolders(map_in=self._base, session=self.session)
 
     def _set_aside(self) -> None:
@@ -156,12 +157,14 @@ class MapStore:
         return folder.rename(next(to for to in map(self.folder.with_name, names) if not to.exists()))
 
     def _is_as_left(self) -> bool:
-        """Whether the saved map is what was written last, or what the unfinished session began with."""
+        """Whether the saved map is what was written last, or what the unfinished session began with.
+
+        So it is taken to be where an older version left the session: it noted nothing.
+        """
         try:
-            left = read_text(_saved_file(self.folder))
-        except FileNotFoundError:  # nothing was joined
-            left = _checksum(self._base_folder)
-        return _checksum(self.folder) == left
+            return _checksum(self.folder) == read_text(_saved_file(self.folder))
+        except FileNotFoundError:
+            return True
 
     def _join_left_over(self, base: Path, stopped: Callable[[], bool]) -> bool:
         """In a process of its own, which a stop ends. Returns whether nothing is left to join."""

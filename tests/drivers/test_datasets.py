@@ -180,6 +180,9 @@ def test_poses_of_a_marker_are_those_of_the_body(tmp_path: Path) -> None:
     body_T_marker = np.array(json.loads(marker), float).reshape(4, 4)
     body_T_left = source.rig.body_T_left
     assert truth is not None and moved is not None
+    (folder / "sensor.yaml").write_text("T_BS: {data: [1, 2]}\n")
+    with open_source(root) as source:  # which stops no run
+        assert source.ground_truth is not None
     expected = truth.poses @ se3.inverse(body_T_left) @ se3.inverse(body_T_marker) @ body_T_left
     np.testing.assert_allclose(moved.poses, expected, atol=1e-9)
 

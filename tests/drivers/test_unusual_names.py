@@ -17,6 +17,7 @@ from stereo_sfm.calib.side_names import side_pairs
 from stereo_sfm.calib.views import find_pairs
 from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.choice import SourceChoice
+from stereo_sfm.drivers.image_lists import natural_key
 from stereo_sfm.drivers.images.source import find_pair
 from stereo_sfm.drivers.mcap.topics import is_rectified
 from stereo_sfm.drivers.times_file import read_times
@@ -194,3 +195,8 @@ def test_pairs_of_topics() -> None:
     assert side_pairs(["/cleft/image", "/cright/image", "/x/cam0", "/x/cam1"])[0] == ("/cleft/image", "/cright/image")
     assert side_pairs(["/cam1/image", "/cam2/image", "/cam0/image"])[0] == ("/cam0/image", "/cam1/image")
     assert not side_pairs(["/left/image", "/right/mask"])
+
+
+def test_numbers_after_a_serial_number_are_counted() -> None:
+    names = [f"843112073259.{k}.png" for k in (1, 2, 9, 10, 11)]
+    assert [p.name for p in sorted(map(Path, reversed(names)), key=natural_key)] == names

@@ -153,6 +153,10 @@ def test_columns_are_those_that_the_first_line_names(
 
 
 def test_angles_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "both.csv").write_text(
+        "timestamp,x,y,z,qx,qy,qz,qw,roll,pitch,yaw\n0.1,1,2,3,0,0,0.6,0.8,0.1,0.2,0.3\n"
+    )
+    assert read_trajectory(tmp_path / "both.csv").poses[0, 0, 0] == pytest.approx(0.28)
     (tmp_path / "t.csv").write_text("timestamp,x,y,z,roll,pitch,yaw,speed\n0.1,1,2,3,0.1,0.2,0.3,4\n")
     with pytest.raises(StereoSfmError, match="angles instead of quaternions"):
         read_trajectory(tmp_path / "t.csv")

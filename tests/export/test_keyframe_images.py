@@ -113,6 +113,9 @@ def test_images_are_paired_as_in_the_run(tmp_path: Path) -> None:
     with open_recording(SPEC, [MapCamera(rig)], run=tmp_path) as shifted:
         seen = list(shifted)
     assert len(seen) == len(images) - 1
+    other = SPEC.replace("aisle", "loop")
+    with open_source(other) as source, open_recording(other, [MapCamera(source.rig)], run=tmp_path) as as_it_is:
+        assert len(list(as_it_is)) == len(images)  # not the recording of this run
     for k, image in enumerate(seen):
         right = images[k + 1].right
         assert image.frame_id == k and image.right is not None and right is not None

@@ -51,6 +51,9 @@ class Places:
         map_T_odom = np.eye(4) if place is None else place @ se3.inverse(keyframe.odom_T_cam)
         return MapUpdate(1, keyframe.kf_id, no_ids(), np.zeros((0, 4, 4)), map_T_odom=map_T_odom)
 
+    def relocalize(self) -> None:
+        self.asked.append(-1)
+
 
 @pytest.fixture
 def session(monkeypatch: pytest.MonkeyPatch) -> Any:
@@ -109,3 +112,18 @@ def test_a_new_submap_is_placed_and_joined_by_the_saved_map(session: Any) -> Non
         assert found[k] == pytest.approx([100 + k, 0, 0], abs=1e-6)
     own = extension.map.keyframes.map_T_kf[:, :3, 3]  # in the session's own map, too
     assert own[3] - own[0] == pytest.approx([3, 0, 0], abs=1e-6)
+
+
+def test_a_place_that_the_session_contradicts_is_not_taken(session: Any) -> None:
+    """The session's own loops have joined its submaps; then another aisle looks like the place."""
+    extension = session({0: at(100), 9: at(140, 7.0)})
+    for k in range(4):
+        extension.step(keyframe(k, 0, at(k)))
+    for k in range(4, 9):
+        loop = LoopResult(k - 1, k - 3, at(2), 1e6 * np.eye(6), no_ids(0, 2), 100, 1.0, "") if k in (6, 8) else None
+        extension.step(keyframe(k, 1, at(k)), loop)
+    seen = keyframe(9, 1, at(9))
+    update = extension.step(seen)
+    assert extension._localizer.asked[-2:] == [9, -1]  # and the whole map is searched again
+    assert pose(update, seen) == pytest.approx([109, 0, 0], abs=1e-3) and not len(update.refused_kf_ids)
+    assert not len(extension.step(keyframe(10, 1, at(10))).refused_kf_ids)

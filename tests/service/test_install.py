@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import configparser
+import os
+import pwd
 import tomllib
 from pathlib import Path
 
@@ -49,6 +51,7 @@ def test_a_program_in_a_home_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir(mode=0o700)
     with pytest.raises(StereoSfmError, match="the user robot may not enter"):
         install.check_reach(tmp_path / "home" / "stereo-sfm", "robot")
+    install.check_reach(tmp_path / "home" / "stereo-sfm", pwd.getpwuid(os.getuid()).pw_name)  # whose home it is
 
 
 def test_a_missing_installation_is_reported(
