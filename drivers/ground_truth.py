@@ -11,7 +11,7 @@ import numpy as np
 from stereo_sfm.calib.formats.common import read_yaml, reading, rigid
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.input_file import read_text
+from stereo_sfm.input_file import first_line, read_text
 from stereo_sfm.types import F64, I64, Trajectory
 
 # Columns of the quaternion's x y z w, after the stamp and the position.
@@ -115,7 +115,7 @@ def _order(path: Path, otherwise: tuple[int, ...]) -> tuple[int, ...]:
 
 def _names(path: Path) -> list[str]:
     """The cells of the first line in lower case, without units."""
-    line = read_text(path).partition("\n")[0].strip().lstrip("#").lower()
+    line = first_line(path).strip().lstrip("#").lower()
     line = re.sub(r"\[[^]]*\]|\([^)]*\)", "", line)
     return [cell.strip() for cell in (line.split(",") if "," in line else line.split())]
 
@@ -206,7 +206,7 @@ def read_trajectory(path: Path | str) -> Trajectory:
     if [name.rstrip("s") for name in _names(path)[:2]] == ["sec", "nsec"]:
         return _read_two_stamps(path)
     first = _rows(path, 8, alone=True)[0]
-    in_ns = len(first[0]) >= 15 or "[ns]" in read_text(path).partition("\n")[0]  # whose clock began at its start
+    in_ns = len(first[0]) >= 15 or "[ns]" in first_line(path)  # whose clock began at its start
     return read_euroc(path) if first[0].isdigit() and in_ns else read_tum(path)
 
 

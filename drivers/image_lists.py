@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from stereo_sfm.drivers.ground_truth import read_kitti, stamp_from_seconds
+from stereo_sfm.drivers.ground_truth import stamp_from_seconds
 from stereo_sfm.drivers.text_file import LAST_NS, nanoseconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import visible
 from stereo_sfm.pixels import SUFFIXES
-from stereo_sfm.types import Trajectory
+from stereo_sfm.types import F64, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -214,18 +214,21 @@ def lines_of(name: str, images: list[Path], lines: int, what: str, first: int | 
 
 
 def truth_of_lines(
-    name: str, path: Path, images: list[Path], stamps: Mapping[Path, int], first: int | None = None
+    name: str,
+    poses: F64,
+    what: str,
+    images: list[Path],
+    stamps: Mapping[Path, int],
+    first: int | None = None,
 ) -> Trajectory | None:
-    """Poses in KITTI's format, a line for each image: those of the images by their numbers, as of `lines_of`.
-
-    None, with a warning, where the numbers do not tell the lines.
+    """The poses of images from a list without stamps, matched as by `lines_of`. None, with a warning, if none can be.
 
     Args:
-        stamps: of the images.
+        poses: (N, 4, 4), one a line.
+        stamps: of the images. name, what, images, first: as of `lines_of`.
     """
-    poses = read_kitti(path).poses
     try:
-        line = lines_of(name, images, len(poses), path.name, first)
+        line = lines_of(name, images, len(poses), what, first)
     except StereoSfmError as error:
         log.warning("%s: there is no ground truth", error)
         return None

@@ -24,6 +24,7 @@ MOST_YAML = 1 << 16  # bytes of what describes one picture
 MOST_DEPTH = 32  # of YAML
 MOST_VALUES = 1_000_000  # of YAML, with every alias written out
 MOST_CHARS = 1 << 16  # of one value of YAML
+MOST_HEADER = 1 << 12  # bytes of the first line that are looked at
 
 
 def with_plain_numbers(tree: Any) -> Any:
@@ -124,6 +125,12 @@ def read_text(path: Path, most: int = MOST_TEXT, encoding: str = "utf-8-sig") ->
         OSError: it cannot be read. UnicodeError: it is something else.
     """
     return read_bytes(path, most).decode(encoding)
+
+
+def first_line(path: Path) -> str:
+    """The first line of a text, without reading the rest. Errors as of `open_regular`."""
+    with open_regular(path) as file:
+        return file.readline(MOST_HEADER).decode("utf-8-sig", "replace")
 
 
 def read_json(path: Path, most: int = MOST_JSON) -> Any:

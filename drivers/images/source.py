@@ -67,9 +67,9 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
         for (left, right), skew in zip(pairs, skews, strict=True)
     ]
     truth = next((folder / n for n in TRUTH_NAMES if (folder / n).is_file()), None)
-    poses = None
-    if truth is not None:
-        poses = read_trajectory(truth) if has_stamps(truth) else truth_of_lines(name, truth, found[0], stamps)
+    poses = None if truth is None else read_trajectory(truth)
+    if truth is not None and poses is not None and not has_stamps(truth):
+        poses = truth_of_lines(name, poses.poses, truth.name, found[0], stamps)
     source = FolderSource(name, chosen_rig(options.rig, lambda: _own_rig(folder)), frames, poses)
     if options.fps is None and not _stamped(folder, found[0]):
         source.assumed_hz = ASSUMED_FPS

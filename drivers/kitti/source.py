@@ -19,6 +19,7 @@ from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files, tr
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import Trajectory
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.kitti import KittiOptions
@@ -48,11 +49,12 @@ def open_kitti(path: str, options: KittiOptions) -> FolderSource:
     ]
     chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), pair=sides))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
-    truth = None
-    if truth_file.is_file() and len(read_kitti(truth_file)) == len(stamps):
-        truth = read_kitti(truth_file, np.array(stamps, np.int64))
-    elif truth_file.is_file():  # of the whole sequence, where the images are a part
-        truth = truth_of_lines(name, truth_file, lefts, {left: stamps[k] for left, k in line.items()}, first=0)
+    truth = read_kitti(truth_file) if truth_file.is_file() else None
+    if truth is not None and len(truth) == len(stamps):
+        truth = Trajectory(np.array(stamps, np.int64), truth.poses)
+    elif truth is not None:  # of the whole sequence, where the images are a part
+        at = {left: stamps[k] for left, k in line.items()}
+        truth = truth_of_lines(name, truth.poses, truth_file.name, lefts, at, first=0)
     return FolderSource(name, chosen, frames, None if truth is None else moved(truth, chosen.body_T_left))
 
 

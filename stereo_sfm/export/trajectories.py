@@ -8,10 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.input_file import open_regular
+from stereo_sfm.input_file import first_line
 from stereo_sfm.types import F64, I64, Trajectory
-
-MOST_HEADER = 1 << 10  # bytes of the first line that are looked at
 
 
 def seconds(stamp_ns: int) -> str:
@@ -35,8 +33,7 @@ def named_pose(path: Path, otherwise: str = "world_T_cam0") -> str:
 
     `otherwise` for files of other programs without such a header.
     """
-    with open_regular(path) as stream:
-        found = re.match(r"#.*\b(world_T_(?:cam0|body))\b", stream.readline(MOST_HEADER).decode(errors="replace"))
+    found = re.match(r"#.*\b(world_T_(?:cam0|body))\b", first_line(path))
     return found[1] if found else otherwise
 
 
