@@ -127,7 +127,7 @@ class StereoMatcher:
         else:
             uv_right, sigma_px = points_from_depth(self._rig, right, uv)[1], self._usual_sigma(uv)
             good = np.isfinite(uv_right[:, 0])
-        return self._triangulated(uv, uv_right, sigma_px, good)
+        return self._triangulated(uv, uv_right, sigma_px, good, gated=isinstance(right, tuple))  # computed ones fit
 
     @staticmethod
     def _gives_way(failed: F64, needed: int) -> float:
