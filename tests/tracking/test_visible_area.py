@@ -50,6 +50,17 @@ def test_a_dark_scene_is_not_taken_for_the_rim() -> None:
     assert area.mask[before & (angles(camera) < 77)].all()
 
 
+@pytest.mark.parametrize("first", ["dark", "bright"])
+def test_a_dark_image_says_nothing_of_the_rim(first: str) -> None:
+    """The lamps go out, or the exposure has not settled: the noise of black is as bright beyond the rim as within."""
+    camera = fisheye_rig().left
+    area = VisibleArea(camera, 88.0)
+    dark = np.random.default_rng(0).integers(0, 4, half_image(camera, 80, 100).shape).astype(np.uint8)
+    for image in [dark, half_image(camera, 72, 160)][:: 1 if first == "dark" else -1]:
+        area.learn(image)
+    assert not area.mask[angles(camera) > 70.5].any()
+
+
 def test_narrow_lenses_have_no_rim() -> None:
     camera = Pinhole(640, 480, 400, 400, 320, 240)
     area = VisibleArea(camera, 88.0)

@@ -23,7 +23,7 @@ STEP = 2  # px of the half image between the sampled ones
 CENTRE_DEG = 45.0  # angle from the axis within which the brightness is that of the scene
 MIN_RIM_DEG = 60.0  # smaller angles are dark surroundings, not the rim
 LIT = 0.3  # of the median brightness in the centre, above which a pixel is bright
-LIT_SHARE = 0.1  # of bright pixels at one angle, above which it is inside the image circle
+LIT_SHARE = 0.1  # of bright pixels at one angle, at which it is inside the image circle
 WINDOW = 7  # px of the half image: margin to the rim for the windows of points
 GRID = 8, 6  # columns and rows of cells, over which points should be spread
 
@@ -44,7 +44,8 @@ class VisibleArea:
             angle = np.nan_to_num(np.degrees(np.arccos(np.clip(grid[..., 2], -1, 1))), nan=180.0)
         self._camera = camera
         self._degree = angle.astype(np.int64)  # (H / 4, W / 4)
-        self._lit = np.zeros(181)  # largest share of bright pixels so far at each degree
+        self._centre = 0  # median brightness in the centre, of the brightest image so far
+        self._lit: I64 = np.zeros(181, np.int64)  # brightness that LIT_SHARE of pixels at each degree reached
         self._rim_deg = 181
         self._allowed = corner_mask(camera, max_angle_deg)
         self._used = np.ones_like(self._allowed) if mask is None else uncovered(half_size(mask), WINDOW // 2)
@@ -59,8 +60,9 @@ class VisibleArea:
         """Update the rim with an image, level 1 of its pyramid."""
         if self._degree[0, 0] < MIN_RIM_DEG:
             return
-        self._lit = np.maximum(self._lit, _bright_shares(half_image[::STEP, ::STEP], self._degree))
-        rim = int(np.flatnonzero(self._lit >= LIT_SHARE).max(initial=0)) + 1
+        centre, lit = _brightness(half_image[::STEP, ::STEP], self._degree)
+        self._centre, self._lit = max(self._centre, centre), np.maximum(self._lit, lit)
+        rim = int(np.flatnonzero(self._lit > LIT * self._centre).max(initial=0)) + 1
         if rim >= MIN_RIM_DEG and rim != self._rim_deg:
             self._rim_deg = rim
             shown = self._camera.valid_mask(math.radians(rim), step=2).astype(np.uint8)
@@ -72,27 +74,29 @@ class VisibleArea:
 
 
 @njit
-def _bright_shares(image, degree):
-    """(181,) share of bright pixels at each degree from the axis; image (H, W) uint8, degree (H, W)."""
-    centre, total, bright = np.zeros(256, np.int64), np.zeros(181), np.zeros(181)
+def _brightness(image, degree):
+    """Median within CENTRE_DEG, and (181,) what LIT_SHARE of the pixels at each degree from the axis reach.
+
+    Args: image (H, W) uint8, degree (H, W).
+    """
+    counts = np.zeros((181, 256), np.int64)
     for y in range(image.shape[0]):
         for x in range(image.shape[1]):
-            total[degree[y, x]] += 1
-            if degree[y, x] < CENTRE_DEG:
-                centre[image[y, x]] += 1
-    limit, below, half = 0, 0, 0.0
-    for value in range(256):
-        half += centre[value] / 2
-    while limit < 255 and below + centre[limit] < half:
-        below += centre[limit]
-        limit += 1
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            if image[y, x] > LIT * limit:
-                bright[degree[y, x]] += 1
+            counts[degree[y, x], image[y, x]] += 1
+    lit = np.zeros(181, np.int64)
     for k in range(181):
-        bright[k] /= max(total[k], 1.0)
-    return bright
+        total, value = counts[k].sum(), 255
+        reached = counts[k, value]
+        while value > 0 and reached < LIT_SHARE * total:
+            value -= 1
+            reached += counts[k, value]
+        lit[k] = value if total > 0 else 0
+    centre = counts[: int(CENTRE_DEG)].sum(axis=0)
+    median, below = 0, 0
+    while median < 255 and below + centre[median] < centre.sum() / 2:
+        below += centre[median]
+        median += 1
+    return median, lit
 
 
 @njit
