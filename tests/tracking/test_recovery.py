@@ -370,3 +370,19 @@ def test_one_image_without_a_pose_after_a_gap_begins_no_new_submap() -> None:
     *_, other, again = tracked(images)
     assert other.state == TrackState.LOST
     assert again.state in (TrackState.LOST, TrackState.RECOVERED)
+
+
+def test_a_car_that_goes_on_as_before_is_where_it_can_be() -> None:
+    """Its speed does not return to that of a robot in a store."""
+    motion = MotionPrior()
+    for t in np.arange(0.0, 1.05, 0.1):
+        motion.add(round(t * 1e9), se3.exp(np.array([0.0, 0.0, 12.0 * t, 0.0, 0.0, 0.0])))
+    for t in (1.5, 2.0, 3.0):
+        there = se3.exp(np.array([0.0, 0.0, 12.0 * t, 0.0, 0.0, 0.0]))
+        assert motion.expect(round(t * 1e9)).sigmas_off(there) < REACH
+
+
+def test_the_prior_is_stale_after_a_second_without_a_trusted_pose() -> None:
+    motion = MotionPrior()
+    motion.add(0, np.eye(4))
+    assert not motion.stale(1_000_000_000) and motion.stale(1_100_000_000)

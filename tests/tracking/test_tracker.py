@@ -247,3 +247,19 @@ def test_a_tracker_that_loses_its_second_image_begins_anew_at_once_but_once() ->
     states = [tracker.step(image)[0].state for image in images]
     ok, lost, begun = TrackState.OK, TrackState.LOST, TrackState.RESTARTED
     assert states == [ok, lost, begun, lost, lost, lost]
+
+
+def test_a_hiccup_of_the_clock_is_no_motion(data_root: Path) -> None:
+    """Two images are stamped a millisecond apart: 30 m/s would look for the next one far away."""
+    with open_source(data_root / "euroc_mh01") as source:
+        images = list(islice(source, 26))
+        tracker = Tracker(CONFIG, source.rig)
+    late = images[20].stamp_ns - 1_000_000
+    images[19] = dataclasses.replace(images[19], stamp_ns=late)
+    speeds = list[float]()
+    for image in images:
+        frame, _ = tracker.step(image)
+        speeds.append(float(np.linalg.norm(tracker._velocity[:3])))
+        assert frame.state == TrackState.OK
+    assert max(speeds[19:]) < 2 * max(speeds[5:19])
+    assert np.sqrt(tracker._solver._difference[0]) < 20.0

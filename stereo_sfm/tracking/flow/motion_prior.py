@@ -71,6 +71,10 @@ class MotionPrior:
         """Discard all poses: a new odometry begins."""
         self._poses.clear()
 
+    def stale(self, stamp_ns: int) -> bool:
+        """Whether no pose of the last second was trusted: any is better than one from before."""
+        return stamp_ns - self._poses[-1][0] > WINDOW_S * 1e9
+
     def velocity(self) -> F64:
         """(6,) mean tangent a second; zero before there is motion."""
         (first_ns, first), (last_ns, last) = self._poses[0], self._poses[-1]
@@ -87,8 +91,10 @@ class MotionPrior:
         (last_ns, last), periods = self._poses[-1], self._seconds(stamp_ns) / RETURN_S
         gone = -np.expm1(-periods)  # share of a speed that is gone
         known = 0.0 if self._poses[0][0] == last_ns else gone**2  # by the velocity, once there is motion
-        sigmas = SPREAD * RETURN_S * np.sqrt(np.maximum(2 * (periods - gone) - known, 0.0))
-        return Expectation.around(last @ se3.exp(self.velocity() * np.repeat(RETURN_S * gone, 3)), sigmas)
+        velocity = self.velocity()
+        spread = np.maximum(SPREAD, np.linalg.norm(velocity.reshape(2, 3), axis=1))  # who is faster is no such robot
+        sigmas = spread * RETURN_S * np.sqrt(np.maximum(2 * (periods - gone) - known, 0.0))
+        return Expectation.around(last @ se3.exp(velocity * np.repeat(RETURN_S * gone, 3)), sigmas)
 
     def steady(self, stamp_ns: int) -> Expectation:
         """The pose at a time if the robot goes on straight at its speed, which most do most of the time."""

@@ -8,6 +8,7 @@ corners of the whole image for the loop closer.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
@@ -53,6 +54,8 @@ TRUSTED_LEFT = 0.5  # of the newest keyframe's points, with which a pose may be 
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on
 REFERENCE_NS = 200_000_000  # from one image that may become the reference to the next
+SHORT = 0.5  # of the usual interval between images: a shorter one is an error of the clock
+USUAL = 15  # intervals whose median is the usual one
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
 REFERENCE_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
@@ -104,6 +107,7 @@ class Tracker:
         self._pose: F64 = np.eye(4)
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
+        self._intervals: deque[float] = deque(maxlen=USUAL)  # seconds between the last images
         self._loss = Loss(config.lost_s)
         self._part = PartialView()
         self._bridging = False  # tracking restarts at the pose by IMU or wheels, in the same submap
@@ -169,13 +173,15 @@ class Tracker:
         self.solution = solution
         if self._sensors is not None:
             solution.pose = self._sensors.corrected(image.stamp_ns, solution.pose, solution.covariance)
-        self._refine(tracks, solution, expected, recovered)
+        timed = self._timed(expected.seconds)
+        self._refine(tracks, solution, expected, recovered or not timed)
         trusted = self._trusted(tracks, solution)
-        if trusted:
+        if trusted or self._recovery.motion.stale(image.stamp_ns):
             self._recovery.motion.add(image.stamp_ns, solution.pose)
+        if trusted:
             self._renew_reference(image, images, tracks, solution)
         stats = _stats(tracks, solution)
-        inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
+        inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered or not timed)
         if self._readout is not None:
             self._readout.add(image.stamp_ns, self._pose, self._tracks, inlier)
             self._use_readout(self._readout)
@@ -363,26 +369,39 @@ class Tracker:
         tracks: Tracks,
         solution: PoseSolution,
         seconds: float,
-        recovered: bool,
+        jumped: bool,
     ) -> Bool:
-        """Update the state with the image's pose; returns which of the remaining points (N,) are inliers."""
-        if seconds > 0:
+        """Update the state with the image's pose; returns which of the remaining points (N,) are inliers.
+
+        `jumped`: the motion since the last image, in `seconds`, is not that of the camera.
+        """
+        if seconds > 0 and not jumped:
             mean = se3.log(se3.inverse(self._pose) @ solution.pose) / seconds
             self._shutter.learn(mean, seconds)
             self._velocity = solution.velocity if self._shutter.active else mean
-        if recovered:
+        if jumped:
             self._velocity = self._recovery.motion.velocity()
         inlier = solution.inlier & ~tracks.moving
         self._loss.followed()
         tracks.age = tracks.age + np.int32(1)
-        static = static_frames(seconds)
+        static = static_frames(max(seconds, SHORT * self._usual_s))
         tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert, static)
         self._movers.update(self._tracks, tracks, self._rig.left, solution.pose)
         self._continue(image, images, solution.pose, tracks)
         if self._sensors is not None:
             self._sensors.accept(image.stamp_ns, solution.pose)
-        self._keyframes.count_frame(seconds if recovered or 2 * np.count_nonzero(inlier) < len(inlier) else 0.0)
+        self._keyframes.count_frame(seconds if jumped or 2 * np.count_nonzero(inlier) < len(inlier) else 0.0)
         return inlier[kept]
+
+    def _timed(self, seconds: float) -> bool:
+        """Whether the interval since the last image tells how fast the camera moves; clocks of computers hiccup."""
+        self._intervals.append(seconds)
+        return seconds > SHORT * self._usual_s
+
+    @property
+    def _usual_s(self) -> float:
+        """The usual interval between images."""
+        return median(np.array(self._intervals))
 
     def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
