@@ -204,7 +204,9 @@ class Mapper(AnyMapper):
 
     def _update(self, kf_id: int) -> MapUpdate:
         (kf, gone, pt), table = self.map.take_delta(), self.map.keyframes
-        first = np.flatnonzero(table.alive & (table.submap_id == table.submap_id[0]))  # whose frame is the map's
+        felt = table.alive & (table.down_sigma > 0)
+        first = felt & (table.submap_id == table.submap_id[0])  # whose frame is the map's
+        level = np.flatnonzero(first if first.any() else felt)
         culled = self.map.points.pt_id[np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))]
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
         refused = np.array(self._refused, np.int64)
@@ -228,7 +230,7 @@ class Mapper(AnyMapper):
             calibration=revised,
             row_errors=row_errors,
             sensors=self._sensor_update,
-            down=mean_down(table.map_T_kf[first], table.down[first], table.down_sigma[first]),
+            down=mean_down(table.map_T_kf[level], table.down[level], table.down_sigma[level]),
         )
 
     # -- calibration -------------------------------------------------------------------------------------------------

@@ -129,3 +129,15 @@ def test_the_mapper_says_where_down_is_and_keeps_without_gravity_what_it_did() -
     assert np.degrees(np.linalg.norm(np.cross(held.down, DOWN))) < 0.05
     off = tilt_deg(level.map.keyframes.map_T_kf, truth[:12])
     assert off.max() < 0.1 and (mapper.map.keyframes.map_T_kf != level.map.keyframes.map_T_kf).any()
+
+
+def test_gravity_that_the_first_submap_did_not_feel_is_known() -> None:
+    """Tracking was lost in the first seconds, before the accelerometer was trusted."""
+    sequence = make_sequence([0], seed=2)
+    truth = se3.inverse(sequence.world_T_kf[0]) @ sequence.world_T_kf
+    mapper = Mapper(MapperConfig(), sequence.rig)
+    for k, down in zip(sequence.keyframes[:8], measured(truth, 1e-4), strict=False):
+        felt = {"down": down, "down_sigma": 1e-3, "submap_id": 1} if k.kf_id > 2 else {}
+        ids = k.point_ids + 10**6 * bool(felt)
+        update = mapper.step(dataclasses.replace(k, **felt, point_ids=ids))
+    assert np.degrees(np.linalg.norm(np.cross(update.down, DOWN))) < 0.2

@@ -343,3 +343,29 @@ def test_a_drone_is_tracked_through_the_dark(data_root: Path) -> None:
         assert np.linalg.norm(seen[:3, 3] - (se3.inverse(start) @ pose)[:3, 3]) < limit
     blind = list(run(MemorySource(replace(rig, imu=None), images, truth), config))
     assert TrackState.LOST in {f.state for f in blind}
+
+
+def test_an_accelerometer_that_stops_is_not_held() -> None:
+    session = Session(seconds=4.0)
+    good = session.samples()
+    accel = good.accel.copy()
+    accel[good.stamp_ns > 2_000_000_000] = np.nan
+    stopped = SampleBuffer(session.imu)
+    for k in range(0, len(good), 10):
+        rows = slice(k, k + 10)
+        stopped.add(ImuSamples(good.stamp_ns[rows], good.gyro[rows], accel[rows]))
+    assert stopped.between(1_000_000_000, 2_400_000_000) is not None
+    assert stopped.between(2_000_000_000, 3_500_000_000) is None
+
+
+def test_a_gyroscope_agrees_with_the_images_of_a_fast_camera() -> None:
+    """At 200 Hz the noise of a pose is a tenth of a radian a second, which is not the sensor's."""
+    session, rng = Session(seconds=3.0), np.random.default_rng(0)
+    samples, motion, at = session.samples(0), InertialMotion(session.imu), 0
+    for stamp in range(0, round(session.seconds * 1e9), 5_000_000):
+        until = int(np.searchsorted(samples.stamp_ns, stamp, side="right"))
+        motion.feed(samples.part(slice(at, until)))
+        at = until
+        noise = np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 3e-4, 3)])
+        motion.accept(stamp, session.pose(stamp * 1e-9) @ se3.exp(noise))
+        assert not motion.left_out

@@ -13,7 +13,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
 from stereo_sfm.tracking.inertial.agreement import ForceAgreement, RateAgreement, SensorUse
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
-from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
+from stereo_sfm.tracking.inertial.inertial_filter import ROTATION_SIGMA, WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.rotation_filter import JUDGED, RotationFilter
 from stereo_sfm.tracking.inertial.series import Intervals, SampleBuffer
@@ -267,7 +267,8 @@ class InertialMotion:
             return
         seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]
         off = se3.so3_log(motion.rotation.T @ seen)
-        self._turn_errors = [*self._turn_errors[1 - JUDGED :], float(off @ off) / motion.seconds**2]
+        beyond = max(float(off @ off) - 6 * ROTATION_SIGMA**2, 0.0)  # the noise of two poses
+        self._turn_errors = [*self._turn_errors[1 - JUDGED :], beyond / motion.seconds**2]
         t = motion.seconds
         self._rates.add(se3.so3_log(motion.rotation) / t + motion.gyro_bias, se3.so3_log(seen) / t, t)
         rates, forces = self._rates.verdict(), self._forces.verdict()

@@ -13,6 +13,7 @@ from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.types import F64, I64, ImuSamples
 
 MAX_GAP_S = 0.05  # between inertial samples: longer ones are not bridged
+STALLED_S = 0.5  # without an acceleration: an accelerometer, which may be slower than its gyroscope, has stopped
 MEMORY_S = 4.0  # how far back intervals may begin, besides the time since the last pose
 LONGEST_S = 120.0  # without a pose, for which samples are kept: in the dark each image would take longer than the last
 
@@ -92,6 +93,8 @@ class SampleBuffer:
         self._accel_alone = np.concatenate([self._accel_alone[-1:], accel[pushed]])
         stamps, gyro = stamps[turned], gyro[turned]
         rows = self._series.after_last(stamps)
+        if len(self._accel_stamp_ns):  # what it showed last is not what it would show now
+            rows = rows[stamps[rows] <= self._accel_stamp_ns[-1] + round(STALLED_S * 1e9)]
         if len(rows) and len(self._accel_stamp_ns):
             at = [np.interp(stamps[rows], self._accel_stamp_ns, a) for a in self._accel_alone.T]
             self._series.add(stamps[rows], np.column_stack([gyro[rows], *at]))
