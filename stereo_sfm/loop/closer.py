@@ -129,9 +129,17 @@ class LoopCloser:
         with self._spans.span("loop_verify"):
             return self._judge(keyframe, candidates, why_none)
 
-    def add(self, keyframe: Keyframe, own: Rig | None = None) -> None:
-        """Add a keyframe of a finished map, to which later ones may close loops. Args: own, as of `step`."""
-        self._keep(keyframe, self._enter(keyframe, own))
+    def add(self, keyframe: Keyframe, own: Rig | None = None, rigid: bool = False) -> None:
+        """Add a keyframe of a finished map, to which later ones may close loops.
+
+        Args: own, as of `step`. rigid: the map is one piece, whose keyframes lie to each other as their poses say.
+        """
+        self._keep(keyframe, self._enter(keyframe, own, rigid))
+
+    def take_back(self, loop: LoopResult) -> None:
+        """The map has refused the loop of the last step: it leads nowhere. Points that it joined stay so."""
+        self._graph.take_back_loop(loop.candidate_kf_id, loop.kf_id)
+        self._same_loop.cache_clear()
 
     def add_loop(self, loop: LoopResult) -> None:
         """Add a loop between added keyframes that was accepted before."""
@@ -146,14 +154,15 @@ class LoopCloser:
         own = [self._own.get(k.kf_id, self._rig) for k in (centre, *around)] if self._own else []
         return gather(centre, around, self._rig, self._config.disparity_sigma_px, sideways, own)
 
-    def _enter(self, keyframe: Keyframe, own: Rig | None) -> tuple[voc.Bag, voc.Bag]:
+    def _enter(self, keyframe: Keyframe, own: Rig | None, rigid: bool = False) -> tuple[voc.Bag, voc.Bag]:
         """Its words and those of its side views; what candidates are judged by knows the keyframe from now on."""
         if own is not None and own is not self._rig:
             self._own[keyframe.kf_id] = own
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):  # the tracker's rig was corrected
             self._rig_terms = keyframe.rig_terms
             self._rig = with_terms(self._source_rig, self._rig_terms)
-        self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns, keyframe.doubt)
+        k = keyframe
+        self._graph.add(k.kf_id, k.odom_T_cam, k.submap_id, k.stamp_ns, k.doubt, rigid)
         with self._spans.span("loop_words"):
             bag, side_bag = (self._vocabulary.bag(c.descriptors) for c in (keyframe.corners, keyframe.sides))
         self._fronts.add(keyframe)

@@ -71,27 +71,46 @@ class KeyframeGraph:
     def __init__(self) -> None:
         self._nodes, self._loops = _Nodes(), _Loops()
         self._joined: dict[int, int] = {}  # submap -> number of the group of submaps that loops connect
+        self._rigid: set[int] = set()  # submaps
+        # What the last loop changed: its newer end, where that was anchored, and the groups.
+        self._before_loop: tuple[int, F64, int, dict[int, int]] | None = None
         self._forget_at = FEWEST
         self.path = functools.lru_cache(REMEMBERED)(self._find_path)
 
     def _row(self, kf_id: int) -> int:
         return int(np.searchsorted(self._nodes.kf_id, kf_id))
 
-    def add(self, kf_id: int, odom_T_cam: F64, submap: int, stamp_ns: int = 0, doubt: F64 | float = 0.0) -> None:
+    def _known(self, kf_id: int) -> bool:
+        row = self._row(kf_id)
+        return row < len(self._nodes) and int(self._nodes.kf_id[row]) == kf_id
+
+    def add(
+        self,
+        kf_id: int,
+        odom_T_cam: F64,
+        submap: int,
+        stamp_ns: int = 0,
+        doubt: F64 | float = 0.0,
+        rigid: bool = False,
+    ) -> None:
         """Append the newest keyframe.
 
         Args:
             submap: number of the uninterrupted part of the odometry it belongs to. doubt: (2,) m^2, rad^2, see
                 `Keyframe.doubt`.
+            rigid: the submap is a map in one piece: its keyframes are as far from each other as they lie.
         """
         anchored, frame, distance = odom_T_cam, submap, 0.0
         if len(self._nodes):
             last = self._nodes.odom_T_cam[-1]
             doubt = self._nodes.doubt[-1] + doubt
-            distance = float(self._nodes.distance[-1] + np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
+            step = 0.0 if rigid else float(np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
+            distance = float(self._nodes.distance[-1]) + step
             if self._nodes.submap[-1] == submap:
                 anchored, frame = self._nodes.anchored[-1] @ se3.inverse(last) @ odom_T_cam, self._nodes.frame[-1]
         self._joined.setdefault(submap, submap)
+        if rigid:
+            self._rigid.add(submap)
         self._nodes.append(
             1, kf_id=kf_id, stamp_ns=stamp_ns, submap=submap, odom_T_cam=odom_T_cam, anchored=anchored, frame=frame,
             distance=distance, doubt=doubt,
@@ -169,10 +188,20 @@ class KeyframeGraph:
         """Link two keyframes whose relative pose was verified."""
         self.path.cache_clear()
         nodes, row_a, row_b = self._nodes, self._row(a), self._row(b)
+        self._before_loop = b, nodes.anchored[row_b].copy(), int(nodes.frame[row_b]), self._joined
         self._loops.append(1, ends=(row_a, row_b), a_T_b=a_T_b)
         nodes.anchored[row_b], nodes.frame[row_b] = nodes.anchored[row_a] @ a_T_b, nodes.frame[row_a]
         keep, dropped = self._joined[int(nodes.submap[row_a])], self._joined[int(nodes.submap[row_b])]
         self._joined = {submap: keep if group == dropped else group for submap, group in self._joined.items()}
+
+    def take_back_loop(self, a: int, b: int) -> None:
+        """Without the last loop, which was between these two."""
+        assert self._before_loop is not None and self._before_loop[0] == b and self._known(a)
+        nodes, row = self._nodes, self._row(b)
+        self._loops.keep(np.arange(len(self._loops) - 1))
+        _, nodes.anchored[row], nodes.frame[row], self._joined = self._before_loop
+        self._before_loop = None
+        self.path.cache_clear()
 
     def gap_motion(self, a: int, b: int, a_T_b: F64) -> GapMotion | None:
         """The motion over the shortest gap between two submaps that a loop between them implies; None without a gap.
@@ -220,7 +249,9 @@ class KeyframeGraph:
         return -step[:3, 3] / (1e-9 * float(nodes.stamp_ns[row] - nodes.stamp_ns[before]))
 
     def _find_path(self, a: int, b: int) -> GraphPath | None:
-        """The shortest path (Dijkstra), None if neither odometry nor loops connect the keyframes."""
+        """The shortest path (Dijkstra), None if nothing connects the keyframes or one is forgotten."""
+        if not (self._known(a) and self._known(b)):
+            return None
         nodes, loops = self._nodes, self._loops.ends
         rows = np.unique(np.append(loops.ravel(), (self._row(a), self._row(b))))
         linked = np.flatnonzero(nodes.submap[rows[:-1]] == nodes.submap[rows[1:]])
@@ -232,14 +263,20 @@ class KeyframeGraph:
         if path is None:
             return None
         a_T_b, total, doubt = np.eye(4), 0.0, np.zeros(2)
+        across = np.eye(4)  # a rigid submap, straight
         for k, forward in path:
             p, q = rows[ends[k]]
             odometry = se3.inverse(nodes.odom_T_cam[p]) @ nodes.odom_T_cam[q] if k < len(linked) else None
             p_T_q = self._loops.a_T_b[k - len(linked)] if odometry is None else odometry
-            a_T_b = a_T_b @ (p_T_q if forward else se3.inverse(p_T_q))
-            total += float(metres[k])
+            step = p_T_q if forward else se3.inverse(p_T_q)
+            a_T_b = a_T_b @ step
+            if k < len(linked) and int(nodes.submap[p]) in self._rigid:
+                across = across @ step
+                continue
+            total += float(metres[k] + np.linalg.norm(across[:3, 3]))
+            across = np.eye(4)
             doubt += nodes.doubt[q] - nodes.doubt[p] if k < len(linked) else 0.0
-        return GraphPath(a_T_b, total, np.sqrt(doubt))
+        return GraphPath(a_T_b, total + float(np.linalg.norm(across[:3, 3])), np.sqrt(doubt))
 
 
 def _newest_between(a: I64, b: I64) -> Bool:

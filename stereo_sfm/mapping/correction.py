@@ -31,6 +31,7 @@ COVISIBLE_POINTS = LoopConfig.min_inliers
 ODOMETRY = 0.004, 0.0006
 MAX_STRAIN = 6.0  # sigmas^2 that a loop may keep: chi-squared of six degrees of freedom has this mean
 MAX_NOISE = chi_squared(6, 0.95)  # sigmas^2: noise exceeds that in one of twenty loops
+BRIDGE = 0.5, 0.1  # metres, radians, of what a session predicted over a gap in tracking
 LOOP_SIGMAS = 0.01, 0.003  # metres, radians, smallest standard deviation of a loop: its points are not independent
 
 
@@ -44,7 +45,12 @@ class Correction:
 
 
 def apply_loop(
-    map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig, match_sigma_px: float = 1.0
+    map_: Map,
+    loop: LoopResult,
+    earlier: Sequence[LoopResult],
+    config: LoopConfig,
+    match_sigma_px: float = 1.0,
+    bridges: tuple[I64, I64] | None = None,
 ) -> Correction:
     """Correct the map for an accepted loop.
 
@@ -52,6 +58,7 @@ def apply_loop(
         map_: changed in place.
         earlier: loops applied before, which stay in the pose graph.
         match_sigma_px: noise of one coordinate of a fused point.
+        bridges: rows (B,) and (B,) of keyframes that lie to each other about as they do, though nothing measured it.
 
     Returns:
         `applied` is False if the loop contradicts the rest of the graph; the map is then unchanged.
@@ -61,6 +68,9 @@ def apply_loop(
         return Correction(False, [])
     before = map_.keyframe_poses()
     odometry, closed = odometry_edges(map_, before), loop_edges(map_, [*earlier, loop])
+    if bridges is not None:
+        weak = edges_of_poses(before, *bridges, 0.0, 0.0)
+        odometry = join([odometry, dataclasses.replace(weak, sigmas=np.tile(BRIDGE, (len(weak), 1)))])
     bent = _strain(before, closed) > MAX_NOISE
     part = _components(len(before), join([odometry, Edges(*(column[:-1] for column in vars(closed).values()))]))
     apart, start = part[a] != part[b], before
@@ -163,7 +173,7 @@ def _optimised(
     result = optimise(start, edges, fixed, config.robust, gravity)
     strain = max(_strain(result.poses, closed), _tilt_strain(result.poses, gravity))
     if result.weights[-1] < 0.5 or strain > MAX_STRAIN:
-        edges = join([_with_drift(odometry, start, *ends), closed])
+        edges = join([_with_drift(odometry, closed, start, *ends), closed])
         result = optimise(start, edges, fixed, config.robust, gravity)
     if result.weights[-1] < 0.5:
         return None
@@ -217,21 +227,32 @@ def odometry_edges(map_: Map, poses: F64) -> Edges:
     return dataclasses.replace(edges, sigmas=np.sqrt(edges.sigmas**2 + np.abs(doubt[edges.j] - doubt[edges.i])))
 
 
-def _with_drift(odometry: Edges, poses: F64, a: int, b: int) -> Edges:
+def _with_drift(odometry: Edges, closed: Edges, poses: F64, a: int, b: int) -> Edges:
     """The odometry edges with the uncertainty of systematic drift from row a to row b.
 
     An error of scale or heading is the same in all edges: it accumulates along the path instead of averaging out, and
     parallel edges are not independent. The variances of the edges along the path sum up to (DRIFT * path length)^2.
+    Where odometry alone leads nowhere, as between two sessions, the path crosses the earlier ones of the loops.
     """
     length = np.linalg.norm(poses[odometry.j, :3, 3] - poses[odometry.i, :3, 3], axis=1)
-    shape = (len(poses), len(poses))
-    graph = scipy.sparse.coo_array((length + 1e-9, (odometry.i, odometry.j)), shape=shape).tocsr()
-    path = float(dijkstra(graph, directed=False, indices=a)[b])
+    path = _shortest(length, odometry.i, odometry.j, a, b, len(poses))
+    if not np.isfinite(path):
+        i, j = (np.concatenate([getattr(odometry, n), getattr(closed, n)[:-1]]) for n in "ij")
+        path = _shortest(np.append(length, np.zeros(len(closed) - 1)), i, j, a, b, len(poses))
     if not np.isfinite(path):
         return odometry
     parallel = len(odometry) / max(len(np.unique(odometry.j)), 1)
     drift = np.square(DRIFT) * (length * path)[:, None]
     return dataclasses.replace(odometry, sigmas=np.sqrt(parallel * (odometry.sigmas**2 + drift)))
+
+
+def _shortest(length: F64, i: I64, j: I64, a: int, b: int, count: int) -> float:
+    """Length of the shortest path from row a to row b of `count` over edges (E,), of parallel ones the shortest."""
+    order = np.argsort(length, kind="stable")
+    pairs = np.sort(np.stack([i[order], j[order]]), axis=0)
+    (i, j), first = np.unique(pairs, axis=1, return_index=True)
+    graph = scipy.sparse.coo_array((length[order][first] + 1e-9, (i, j)), shape=(count, count)).tocsr()
+    return float(dijkstra(graph, directed=False, indices=a)[b])
 
 
 def loop_edges(map_: Map, loops: Sequence[LoopResult]) -> Edges:

@@ -99,7 +99,8 @@ class GrowingMap:
         if self._closer is None:
             self._closer = self._joining.closer(self._vocabulary)
             for keyframe in self._base.snapshot.keyframes():  # the saved map is one rigid piece
-                self._closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), self._rigs[keyframe.kf_id])
+                one = dataclasses.replace(keyframe, submap_id=0, stamp_ns=0)
+                self._closer.add(one, self._rigs[keyframe.kf_id], rigid=True)
             return True
         if not self._queue:
             return self._adjust()
@@ -203,9 +204,13 @@ class GrowingMap:
 
     def _close(self, loop: LoopResult) -> None:
         map_ = self._map
-        if map_.keyframes.alive[map_.kf_row(loop.candidate_kf_id)] and self._joining.close(loop):
+        if not map_.keyframes.alive[map_.kf_row(loop.candidate_kf_id)]:
+            return
+        if self._joining.close(loop):
             self._bent = True
             self._joining.adjust(window.covisible_window(map_, map_.kf_row(loop.kf_id), self._config.mapper))
+        elif self._closer is not None:
+            self._closer.take_back(loop)
 
     def _adjust(self) -> bool:
         """Adjust the whole map, if loops have bent it."""

@@ -25,9 +25,13 @@ log = logging.getLogger("stereo_sfm")
 class Joining:
     """A map of several sessions while loops are put into it."""
 
-    def __init__(self, saved: SavedMap, config: LoopConfig, mapper: MapperConfig) -> None:
-        """Args: saved, what there is. config, of the loops. mapper, of bundle adjustment."""
+    def __init__(self, saved: SavedMap, config: LoopConfig, mapper: MapperConfig, last: I64 | None = None) -> None:
+        """Args:
+        saved: what there is. config: of the loops. mapper: of bundle adjustment.
+        last: (maps,) first free keyframe id after each of the maps in it; None: it is one, and others may follow.
+        """
         self._config, self._mapper = config, mapper
+        self._last = ends([saved], "kf_ids") if last is None else last
         ids = saved.snapshot.kf_ids.tolist()
         self.rigs = dict(zip(ids, saved.keyframe_rigs(), strict=True))  # by keyframe
         self.session_of: dict[int, int] = dict(zip(ids, saved.sessions.tolist(), strict=True))
@@ -49,12 +53,20 @@ class Joining:
         if loop_is_known(self.map, loop):
             fused, applied = fuse_sides(self.map, loop, self._mapper.match_sigma_px), True
         else:
-            done = apply_loop(self.map, loop, self.loops, self._config, self._mapper.match_sigma_px)
+            sigma_px = self._mapper.match_sigma_px
+            done = apply_loop(self.map, loop, self.loops, self._config, sigma_px, self._bridges())
             fused, applied = done.fused, done.applied
         if applied:
             self.loops.append(loop)
         self.fused += len(fused)
         return applied
+
+    def _bridges(self) -> tuple[I64, I64]:
+        """Rows of successive keyframes of each map between which tracking was lost: a map moves as a whole."""
+        table, living = self.map.keyframes, self.map.living_keyframes()
+        of_map = np.searchsorted(self._last, table.kf_id[living], side="right")
+        cut = (table.previous[living[1:]] < 0) & (of_map[1:] == of_map[:-1])
+        return living[:-1][cut], living[1:][cut]
 
     def forget_loops(self) -> None:
         """Of culled keyframes: nothing asks for them, and a session that goes on all day has ever more."""
@@ -107,7 +119,7 @@ def join(
         The maps side by side, and what was made of them.
     """
     both = joined(list(maps))
-    joining = Joining(both, config, mapper)
+    joining = Joining(both, config, mapper, ends(maps, "kf_ids"))
     closer = joining.closer(vocabulary)
     stamps = both.snapshot.stamp_ns
     begins = {k: int(stamps[both.sessions == k].min()) for k in both.session_ids}  # sessions have unrelated clocks
@@ -119,10 +131,10 @@ def join(
         kf_id, stamp_ns = keyframe.kf_id, keyframe.stamp_ns - begins[joining.session_of[keyframe.kf_id]]
         if kf_id >= others_begin:
             result = closer.step(dataclasses.replace(keyframe, stamp_ns=stamp_ns), rig)
-            if result.candidate_kf_id >= 0:
-                joining.close(result)
+            if result.candidate_kf_id >= 0 and not joining.close(result):
+                closer.take_back(result)
         elif rigid:
-            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), rig)
+            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), rig, rigid=True)
         else:  # its own loops are in the map
             closer.add(dataclasses.replace(keyframe, stamp_ns=stamp_ns), rig)
     return both, joining

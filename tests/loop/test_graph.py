@@ -205,3 +205,40 @@ def test_submaps_connected_through_a_third_share_its_gaps() -> None:
     graph.add_loop(6, 7, at(0.5))
     gap_motion = graph.gap_motion(5, 7, at(1.5))
     assert gap_motion is not None and gap_motion.deviation == pytest.approx(0.5)
+
+
+def test_a_loop_that_the_map_refused_leads_nowhere() -> None:
+    graph = KeyframeGraph()
+    for k in range(20):
+        graph.add(k, at(float(k)), k // 10)
+    graph.add_loop(2, 12, at(0.1))
+    graph.add_loop(5, 19, at(0.3))
+    before = graph.around(19)[1]
+    graph.take_back_loop(5, 19)
+    path = graph.path(5, 19)
+    assert path is not None and path.metres == pytest.approx(3.0 + 7.0)
+    np.testing.assert_allclose(path.a_T_b, at(-3.0 + 0.1 + 7.0), atol=1e-12)
+    assert np.isfinite(before[5]).all() and np.isnan(graph.around(19)[1][5]).all()
+    graph.add_loop(3, 13, at(0.2))
+    graph.take_back_loop(3, 13)
+    assert graph.path(2, 12) is not None
+
+
+def test_a_saved_map_in_one_piece_is_as_large_as_it_is() -> None:
+    """Not as long as all the walks in it: two places of it are as far from each other as they lie."""
+    graph = KeyframeGraph()
+    for k, x in enumerate((0.0, 50.0, 1.0, 40.0, 2.0)):  # sessions one after another
+        graph.add(k, at(x), 0, rigid=True)
+    graph.add(5, at(0.0), 1)
+    graph.add(6, at(3.0), 1)
+    graph.add_loop(0, 5, at(0.0))
+    path = graph.path(4, 6)
+    assert path is not None and path.metres == pytest.approx(2.0 + 3.0)
+    np.testing.assert_allclose(path.a_T_b, at(1.0), atol=1e-12)
+
+
+def test_nothing_leads_to_a_keyframe_that_was_forgotten() -> None:
+    graph = KeyframeGraph()
+    for k in range(0, 20, 2):
+        graph.add(k, at(float(k)), 0)
+    assert graph.path(4, 7) is None and graph.path(4, 8) is not None and graph.path(4, 100) is None

@@ -214,3 +214,44 @@ def test_same_map_same_bits(sequence: StoreSequence) -> None:
         return map_.keyframes.map_T_kf.tobytes() + map_.points.xyz.tobytes()
 
     assert bits() == bits()
+
+
+@pytest.mark.parametrize("bridged", [True, False])
+def test_a_session_moves_as_a_whole_though_tracking_was_lost_in_it(sequence: StoreSequence, bridged: bool) -> None:
+    """A saved map, and a session of two submaps, of which one shows a place of the map; the other goes with it."""
+    a, b = ends(sequence)
+    begin = len(sequence.keyframes) // 2
+    cut = (begin + b) // 2
+    astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
+    pieces = list[Keyframe]()
+    physical = dict(sequence.physical)
+    for k, keyframe in enumerate(sequence.keyframes):
+        submap = int(k >= begin) + int(k >= cut)
+        ids = keyframe.point_ids + submap * 10**6
+        physical.update(zip(ids.tolist(), (sequence.physical[i] for i in keyframe.point_ids.tolist()), strict=True))
+        pose = astray @ keyframe.odom_T_cam if submap else keyframe.odom_T_cam
+        pieces.append(dataclasses.replace(keyframe, submap_id=submap, odom_T_cam=pose, point_ids=ids))
+    lost = dataclasses.replace(sequence, keyframes=pieces, physical=physical)
+    map_ = raw_map(lost)
+    bridges = np.array([cut - 1]), np.array([cut])
+    done = apply_loop(map_, true_loop(lost, a, b), [], LoopConfig(), bridges=bridges if bridged else None)
+    assert done.applied
+    assert (trajectory_error(map_, sequence.world_T_kf) < 0.3) == bridged
+
+
+def test_a_loop_between_sessions_that_loops_alone_join_is_allowed_to_drift() -> None:
+    """The session left the map's aisles and comes back 60 m later; its scale is off by what is usual."""
+    map_, truth = turning_sequence(0.2)
+    count = len(truth)
+    cut = count // 4
+    map_.keyframes.previous[cut] = -1  # another session begins, which shares no point with the one before
+    ends_of = [(cut - 1, cut), (0, count - 1)]
+    first, last = (
+        LoopResult(
+            kf_id=b, candidate_kf_id=a, candidate_T_kf=se3.inverse(truth[a]) @ truth[b], information=np.eye(6) * 1e6,
+            matches=np.zeros((0, 2), np.int64), inliers=100, score=0.3, reason="",
+        )
+        for a, b in ends_of
+    )  # fmt: skip
+    assert apply_loop(map_, first, [], LoopConfig()).applied
+    assert apply_loop(map_, last, [first], LoopConfig()).applied
