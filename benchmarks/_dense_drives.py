@@ -94,7 +94,7 @@ def _beside_open3d(
     """
     truth, truth_T_floor = given
     saved, voxel = find_input(run).saved, 0.02
-    floor_T_map = se3.inverse(find_floor(saved.snapshot))
+    floor_T_map = se3.inverse(find_floor(saved.snapshot, saved.rig.base_T_left[2, :3]))
     seen = [
         Seen(depth, floor_T_map @ saved.snapshot.map_T_kf[int(path.stem)], 0)
         for path in sorted((run / "surface" / "depth").glob("*.npz"))

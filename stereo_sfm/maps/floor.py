@@ -14,16 +14,23 @@ from stereo_sfm.types import F64, Bool
 
 LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
 BELOW_M = 0.2  # metres below the camera at which a floor can be
+FEW = 20  # points, fewer show no plane
 THICK_M = 0.05  # metres, of a level: stereo points of a floor a metre or two away scatter by a few centimetres
 
 
-def find_floor(s: MapSnapshot) -> F64:
-    """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
+def find_floor(s: MapSnapshot, up: F64 | None = None) -> F64:
+    """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it.
+
+    `up`: (3,) unit vector in the left camera, of the robot's axes (`Rig.base_T_left`), where gravity is not measured.
+    """
     felt = s.down_sigma > 0  # gravity, where an IMU measured it
     if felt.any():
         down = (s.map_T_kf[felt, :3, :3] @ s.down[felt, :, None])[..., 0].mean(0)
-    else:  # cameras stand upright, though they may look up or down while driving around
-        down = s.map_T_kf[:, :3, 1].mean(0)
+    else:
+        # Cameras stand upright, though they may look up or down while driving around: a body whose z axis is not
+        # upright then is an IMU's.
+        axis = -up if up is not None and up[1] < -0.5 else np.array([0.0, 1.0, 0.0])
+        down = (s.map_T_kf[:, :3, :3] @ axis).mean(0)
     if np.linalg.norm(down) < 0.3:
         raise StereoSfmError(
             "no floor plan: the vertical direction is unknown, since the cameras look in all directions"
@@ -46,11 +53,13 @@ def find_floor(s: MapSnapshot) -> F64:
 def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
     """Normal (pointing down) and depth below the origin of the lowest well-filled plane."""
     depth = points[candidates] @ down
-    if len(depth) < 20:
+    if len(depth) < FEW:
         return down, float(np.percentile(points @ down, 99)) if len(points) else 1.5
     level = floor_level(depth)
     near, normal = points[candidates][np.abs(depth - level) < THICK_M], down
     for _ in range(5):
+        if len(near) < FEW:
+            return down, level
         mean = near.mean(0)
         normal = np.linalg.svd(near - mean, full_matrices=False)[2][2]
         normal *= np.sign(normal @ down)
@@ -58,9 +67,7 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
             return down, level
         distance = (points[candidates] - mean) @ normal
         near = points[candidates][np.abs(distance) < THICK_M]
-        if len(near) < 20:
-            return down, level
-    return normal, float(near.mean(0) @ normal)
+    return (normal, float(near.mean(0) @ normal)) if len(near) >= FEW else (down, level)
 
 
 def floor_level(depth: F64) -> float:

@@ -101,7 +101,8 @@ def read_about(store: Path, saved: SavedMap | None = None) -> About:
     """
     path = store / ABOUT
     if not path.is_file():
-        return About(0, find_floor((saved or load_current(store)).snapshot))
+        saved = load_current(store) if saved is None else saved
+        return About(0, find_floor(saved.snapshot, saved.rig.base_T_left[2, :3]))
     try:
         data: Any = read_yaml(path, MOST_ABOUT)
         aisles = tuple(Aisle(*_line(line)) for line in data["aisles"])
@@ -149,7 +150,7 @@ def write_version(
             copy_map(store, versions_folder(store) / f"{about.version:05d}")
             about = dataclasses.replace(about, version=about.version + 1)
         else:
-            about = About(0, find_floor(saved.snapshot))
+            about = About(0, find_floor(saved.snapshot, saved.rig.base_T_left[2, :3]))
         lines = "".join(f"{line}\n" for line in changes)
         save_map(saved, store, _extras(store) | {ABOUT: _about_text(about), CHANGES: lines.encode()}, compress)
         # Those of a store that was here before this one, which count no more, have higher numbers and go first.
