@@ -18,7 +18,7 @@ import numpy as np
 from stereo_sfm.drivers.repeated import shifted
 from stereo_sfm.drivers.source import Stamps
 from stereo_sfm.drivers.wrapped import WrappedSource
-from stereo_sfm.types import StereoImage
+from stereo_sfm.types import StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -102,6 +102,19 @@ def _stamped(image: StereoImage, stamp_ns: int) -> StereoImage:
 
 class AscendingSource(WrappedSource):
     """Wraps a source: its images with ascending stamps."""
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """One pose for each image has the stamps of the source, and goes on with those of the images."""
+        truth = self.source.ground_truth
+        if truth is None or (np.diff(truth.stamp_ns) > 0).all():
+            return truth
+        clock, rows, stamps, waiting = AscendingStamps(), list[int](), list[int](), list[int]()
+        for k, stamp_ns in enumerate(truth.stamp_ns.tolist()):
+            waiting.append(k)
+            if good := clock.step(stamp_ns):
+                rows, stamps, waiting = rows + waiting[-len(good) :], stamps + good, []
+        return Trajectory(np.array(stamps, np.int64), truth.poses[rows], truth.oriented)
 
     def stamps(self) -> Stamps | None:
         found = self.source.stamps()

@@ -118,7 +118,7 @@ class RecordedRig:
         return out
 
     def truth(self, clock: Clock) -> Trajectory | None:
-        """Poses of the left camera if its pose on the tracked body is known, else of the body itself."""
+        """Poses of the left camera if its pose on the tracked body is known, else positions of the body itself."""
         rows: list[Transform] = []
         for record in self._reader.messages([self._topics.truth] if self._topics.truth else []):
             try:
@@ -132,10 +132,11 @@ class RecordedRig:
         rows.sort(key=lambda row: row.stamp_ns)
         body = rows[0].child
         body_T_cam = chain(self._transforms(), body, self._left_frame) if body else None
-        if body_T_cam is None and (not body or body.lstrip("/") != self._left_frame.lstrip("/")):
+        known = body_T_cam is not None or bool(body and body.lstrip("/") == self._left_frame.lstrip("/"))
+        if not known:
             log.warning(
-                "%s: no transform from the body of %s to the left camera: only errors of positions mean something",
+                "%s: no transform from the body of %s to the left camera: only positions are compared",
                 self._reader.path, self._topics.truth,
             )  # fmt: skip
         poses = np.array([row.matrix for row in rows]) @ (np.eye(4) if body_T_cam is None else body_T_cam)
-        return Trajectory(np.array([row.stamp_ns for row in rows], np.int64), poses)
+        return Trajectory(np.array([row.stamp_ns for row in rows], np.int64), poses, oriented=known)

@@ -136,7 +136,7 @@ def _different(sources: Sequence[str]) -> list[str]:
 
 
 def _check_sources(cells: Sequence[Cell]) -> None:
-    """Check, before anything is computed, that every source can be opened and has ground truth.
+    """Check, before anything is computed, that every source can be opened and has ground truth with rotations.
 
     Raises:
         StereoSfmError: one cannot be opened or has none.
@@ -148,6 +148,11 @@ def _check_sources(cells: Sequence[Cell]) -> None:
             if source.ground_truth is None:
                 raise StereoSfmError(
                     f"{source.name} has no ground truth to compare with: choose a source that has, as sim:loop"
+                )
+            if not source.ground_truth.oriented:
+                raise StereoSfmError(
+                    f"{source.name} has a ground truth of positions alone, and the papers compare rotations, too: "
+                    "choose another source"
                 )
 
 

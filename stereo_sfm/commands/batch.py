@@ -44,18 +44,17 @@ def run(args: argparse.Namespace) -> int:
     results = {}
     for task, result in on_cluster(batch.run_batch(tasks, args.address), args.address):
         results[task.folder] = result
-        state = "ok" if result["ok"] else "failed"
+        state = "failed" if batch.why_failed(result) else "ok"
         again = ", from before" if result.get("resumed") else ""
         print(f"{len(results)}/{len(tasks)} {Path(task.folder).name}: {state}{again}", file=sys.stderr)
         rows = [batch.table_row(n, results[str(f)]) for n, f in zip(names, folders, strict=True) if str(f) in results]
         batch.write_results(rows, args.output)
     print((args.output / "results.md").read_text("utf-8-sig"), end="")
-    maps = [
-        folder / "map" for folder in folders if (folder / "map" / "map.json").exists() and results[str(folder)]["ok"]
-    ]
+    good = [folder for folder in folders if not batch.why_failed(results[str(folder)])]
+    maps = [folder / "map" for folder in good if (folder / "map" / "map.json").exists()]
     if merging and len(maps) > 1:
         print(batch.merge_maps(maps, config, args.output / batch.MAP))
-    return SOME_FAILED if any(not r["ok"] for r in results.values()) else 0
+    return SOME_FAILED if len(good) < len(folders) else 0
 
 
 def _expand(patterns: list[str]) -> list[str]:

@@ -21,7 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, metavar="DIR", help="of two runs: also write the page of 'stereo-sfm compare'"
     )
-    parser.add_argument("--tol", type=float, default=0.0, metavar="X", help="tolerance for numbers")
+    parser.add_argument(
+        "--tol", type=float, default=0.0, metavar="X", help="tolerance for numbers; of runs, those in their logs"
+    )
     parser.add_argument(
         "--all", action="store_true", help="print the first difference of every topic, not only the first of all"
     )
@@ -34,10 +36,10 @@ def run(args: argparse.Namespace) -> int:
             raise StereoSfmError(f"no such file or folder: {path}")
     if args.a.is_dir() != args.b.is_dir():
         raise StereoSfmError("give two folders of runs, or two logs")
-    if args.a.is_dir() and not (args.topics or args.all):
+    if args.a.is_dir() and not (args.topics or args.all or args.tol):
         return _runs([args.a, args.b], args.output)
     if args.output is not None:
-        raise StereoSfmError("--output is for two folders of runs, without --topics and --all")
+        raise StereoSfmError("--output is for two folders of runs, without --topics, --all and --tol")
     paths = [path / "run.mcap" if path.is_dir() else path for path in (args.a, args.b)]
     return _logs(paths[0], paths[1], list(args.topics), float(args.tol), bool(args.all))
 

@@ -179,9 +179,22 @@ def _write_trajectories(options: ExportOptions, output: Path) -> list[Path]:
     found, what = _trajectories(options)
     paths = [output if len(found) == 1 else _of_session(output, session) for session in found]
     _check_free(options, paths)
+    lines = options.source / f"trajectory_{options.which}.kitti"  # of a run: one for every frame, also for lost ones
     for path, trajectory in zip(paths, found.values(), strict=True):
-        export_trajectory(trajectory, path, options.format, what)
+        if options.format == "kitti" and lines.is_file():
+            _copy(lines, path)
+        else:
+            export_trajectory(trajectory, path, options.format, what)
     return paths
+
+
+def _copy(file: Path, path: Path) -> None:
+    from stereo_sfm.errors import writing_to
+    from stereo_sfm.input_file import read_text
+
+    with writing_to(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(read_text(file), encoding="utf-8")
 
 
 def _of_session(path: Path, session: int) -> Path:

@@ -11,6 +11,7 @@ from stereo_sfm.types import F64, I64, Trajectory
 MAX_DIFFERENCE_NS = 10_000_000  # nearest stamps at most 10 ms apart, as evo's default
 A_DAY_NS = 86_400 * 10**9
 MAX_GAP_NS = 250_000_000  # a reference is interpolated between poses at most this far apart
+MIN_HOLE_NS, HOLE_STEPS = 10**9, 10  # a reference is not known in a gap of so long, and of so many of its usual ones
 
 
 def poses_at(trajectory: Trajectory, stamp_ns: I64, max_gap_ns: int = MAX_GAP_NS) -> tuple[F64, I64]:
@@ -47,7 +48,7 @@ def associate(
     Args:
         estimate: the trajectory to evaluate.
         reference: the ground truth.
-        interpolate: take the reference at the estimate's stamps; else its nearest pose.
+        interpolate: take the reference at the estimate's stamps; else its poses with the nearest ones of the estimate.
         max_difference_ns: nearest poses further apart than this are omitted.
 
     Raises:
@@ -59,7 +60,10 @@ def associate(
         poses, kept = poses_at(reference, estimate.stamp_ns)
     else:
         nearest = _nearest(reference.stamp_ns, estimate.stamp_ns)
-        kept = np.flatnonzero(np.abs(reference.stamp_ns[nearest] - estimate.stamp_ns) <= max_difference_ns)
+        apart = np.abs(reference.stamp_ns[nearest] - estimate.stamp_ns)
+        order = np.lexsort((apart, nearest))  # each pose of the reference goes with the nearest of the estimate alone
+        closest = np.sort(order[np.unique(nearest[order], return_index=True)[1]])
+        kept = closest[apart[closest] <= max_difference_ns]
         poses = reference.poses[nearest[kept]]
     if not len(kept):
         raise StereoSfmError(
@@ -73,11 +77,25 @@ def associate(
     )
 
 
+def parts_of(reference: Trajectory, stamp_ns: I64) -> I64:
+    """(N,) at these times: number of the part of a reference that was seen without a hole, as where a body left a
+    motion capture's room. Between two parts its path is not known, and so neither are errors per metre or frame.
+    """
+    steps = np.diff(reference.stamp_ns)
+    if not len(steps):
+        return np.zeros(len(stamp_ns), np.int64)
+    holes = reference.stamp_ns[1:][steps > max(MIN_HOLE_NS, HOLE_STEPS * float(np.median(steps)))]
+    return np.searchsorted(holes, stamp_ns, side="right")
+
+
 def _remedy(estimate: Trajectory, reference: Trajectory) -> str:
-    """What to do where the stamps of one were counted from 0, as those of numbered images are."""
+    """What to do where the stamps of one were counted from 0, or where the reference is too slow to be interpolated."""
     counted, true = sorted((int(estimate.stamp_ns[0]), int(reference.stamp_ns[0])))
     if counted < A_DAY_NS <= true:
         return ": name the images by their stamps, or put a times.txt with their seconds beside them, and run again"
+    interval_ns = float(np.median(np.diff(reference.stamp_ns))) if len(reference) > 1 else 0.0
+    if interval_ns > MAX_GAP_NS:
+        return f": the reference has a pose every {interval_ns / 1e9:.2g} s, --t-max-diff compares the nearest ones"
     return ""
 
 

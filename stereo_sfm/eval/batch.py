@@ -16,6 +16,7 @@ from typing import Any
 
 from stereo_sfm.config import Config, dump
 from stereo_sfm.errors import StereoSfmError, printable
+from stereo_sfm.eval.statistics import failure
 from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.eval.tables import write_table
 from stereo_sfm.input_file import read_json
@@ -79,7 +80,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
                 wall_s = time.perf_counter() - begin - session.waited_s(begin)
             info = session.info
             stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
-        result |= {"ok": True, "stats": stats}
+        result |= {"ok": True, "stats": stats, "failure": failure(stats)}
     except StereoSfmError as error:
         result |= {"ok": False, "error": str(error), "kind": type(error).__name__}
     except (TimeoutError, MemoryError):
@@ -128,14 +129,20 @@ def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterato
         yield of[job.name], {"recording": of[job.name].spec, **result}
 
 
+def why_failed(result: dict[str, Any]) -> str:
+    """Why a recording has no result, or one that counts as failed as that of `run` does; "" where all is well."""
+    return str(result.get("failure", "")) if result["ok"] else result["error"].strip().splitlines()[-1]
+
+
 CELL = 160  # letters of a cell that people read
 COLUMNS = ("recording", "frames", "tracked %", "keyframes", "loops", "path m", "ATE mm", "frames/s", "result")
 
 
 def table_row(name: str, result: dict[str, Any]) -> list[Any]:
     """One line of the table of results; None where there is no value."""
+    why = why_failed(result)
     if not result["ok"]:
-        return [name, *[None] * (len(COLUMNS) - 2), f"failed: {result['error'].strip().splitlines()[-1]}"]
+        return [name, *[None] * (len(COLUMNS) - 2), f"failed: {why}"]
     stats = result["stats"]
     ate = stats["evaluation"].get("map", stats["evaluation"].get("odometry"))
     return [
@@ -147,7 +154,7 @@ def table_row(name: str, result: dict[str, Any]) -> list[Any]:
         round(stats["path_m"], 1),
         None if ate is None else round(ate["ape_m"]["rmse"] * 1e3, 1),
         round(stats["frames_per_s"], 1),
-        str(stats["fingerprint"]),
+        f"failed: {why}" if why else str(stats["fingerprint"]),
     ]
 
 

@@ -73,7 +73,8 @@ def compare(runs: Sequence[ComparedRun], folder: Path) -> Path:
     evaluations = _evaluations(runs, reference)
     rows = [_row(run, evaluations.get(run.name)) for run in runs]
     write_table(folder / "compare", COLUMNS, rows)
-    shown = {run.name: evaluations[run.name].estimate if run.name in evaluations else run.estimate for run in runs}
+    aligned = {name: result.alignment for name, result in evaluations.items()}
+    shown = {r.name: aligned[r.name].apply(r.estimate) if r.name in aligned else r.estimate for r in runs}
     plots.plot_trajectory(folder / "trajectory.png", shown, reference, every_frame=True)
     if evaluations:
         plots.plot_errors(folder / "errors.png", evaluations)

@@ -12,7 +12,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval import metrics
 from stereo_sfm.eval.align import Alignment, align
-from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS, associate
+from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS, associate, parts_of
 from stereo_sfm.eval.metrics import Drift, RetailErrors, Statistics
 from stereo_sfm.types import F64, Trajectory
 
@@ -21,12 +21,13 @@ STRAIGHT = 0.02  # lateral extent of a path, as a share of its length, below whi
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Errors of an estimate. Absolute errors are after `alignment`, all others do not depend on it."""
+    """Errors of an estimate. Absolute errors are after `alignment`; of all others only its scale matters."""
 
     mode: str  # of eval.align.MODES
     alignment: Alignment
     length_m: float  # of the associated reference
     frames: int  # associated
+    of_frames: int  # of the estimate
     ape_m: Statistics  # absolute position error: its rmse is the ATE
     ape_deg: Statistics
     ate_percent: float  # of the path
@@ -82,28 +83,32 @@ def evaluate(
     Raises:
         StereoSfmError: nothing in common, or the alignment is not determined.
     """
+    of_frames, whole = len(estimate), reference
     estimate, reference = associate(estimate, reference, interpolate, max_difference_ns)
+    parts = parts_of(whole, estimate.stamp_ns)
     alignment = align(estimate, reference, mode)
-    pairs = _pairs(reference.poses, delta)
+    pairs = metrics.within(_pairs(reference.poses, delta), parts)
     aligned = alignment.apply(estimate)
     oriented = estimate.oriented and reference.oriented
     # Motions are compared in the body's axes; where those are unknown, in the reference's, after alignment.
-    moving, still = (estimate.poses, reference.poses) if oriented else (_positions(aligned), _positions(reference))
+    scaled = Alignment(np.eye(4), alignment.scale).apply(estimate)
+    moving, still = (scaled.poses, reference.poses) if oriented else (_positions(aligned), _positions(reference))
     rpe_m, rpe_rad = metrics.relative_errors(moving, still, pairs)
-    drift = metrics.kitti_drift(moving, still)
-    retail = metrics.retail_errors(moving, still) if oriented else None
+    drift = metrics.kitti_drift(moving, still, parts)
+    retail = metrics.retail_errors(moving, still, parts) if oriented else None
     sim3_ate, sim3_scale = _sim3(estimate, reference)
     ape_m, ape_rad = metrics.absolute_errors(aligned.poses, reference.poses)
     if not oriented:
         ape_rad, rpe_rad = np.full_like(ape_rad, math.nan), np.full_like(rpe_rad, math.nan)
         drift = None if drift is None else replace(drift, rotation_deg_per_m=math.nan)
     ape = Statistics.of(ape_m)
-    length = reference.length
+    length = metrics.seen_length(reference.poses, parts)
     return Evaluation(
         mode=mode,
         alignment=alignment,
         length_m=length,
         frames=len(estimate),
+        of_frames=of_frames,
         ape_m=ape,
         ape_deg=Statistics.of(np.degrees(ape_rad)),
         ate_percent=100 * ape.rmse / length if length > 0 else math.nan,
@@ -160,7 +165,7 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
     """The printed lines as (name, value with unit)."""
     ape = result.ape_m
     rows = [
-        ("compared", f"{result.frames} frames over {length(result.length_m)}, alignment {result.mode}"),
+        ("compared", f"{_compared(result)} over {length(result.length_m)}, alignment {result.mode}"),
         ("ATE", f"{length(ape.rmse)} rmse, {length(ape.max)} max ({result.ate_percent:.3f} % of the path)"),
         ("ATE, Sim(3)", f"{length(result.ate_sim3_m)} rmse, scale {result.sim3_scale:.5f}"),
         ("rotation", _rotation(result)),
@@ -177,6 +182,11 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
             )
         )
     return rows
+
+
+def _compared(result: Evaluation) -> str:
+    of = f" of {result.of_frames}" if result.frames < result.of_frames else ""
+    return f"{result.frames}{of} frames"
 
 
 def _rotation(result: Evaluation) -> str:

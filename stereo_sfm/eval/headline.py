@@ -31,7 +31,8 @@ def _error(evaluations: dict[str, Evaluation]) -> str:
     if result is None:
         return "but nobody can say how exactly: the recording has no true path to compare with"
     percent = f" ({result.ate_percent:.2g} % of the path)" if result.mode != "sim3" else ", its size left aside"
-    return f"with an error of {length(result.ape_m.rmse)}{percent} against the true path"
+    part = "" if result.frames == result.of_frames else f", which is known for {thousands(result.frames)} of them"
+    return f"with an error of {length(result.ape_m.rmse)}{percent} against the true path{part}"
 
 
 def passed(stats: dict[str, Any]) -> str:

@@ -74,7 +74,7 @@ def pairs_by_frames(count: int, delta: int) -> I64:
 
 
 def pairs_by_metres(reference: F64, delta_m: float, starts: I64 | None = None) -> I64:
-    """(M, 2): from each start the first frame whose distance along the reference is more than `delta_m` further."""
+    """(M, 2): from each start the first pose whose distance along the reference is more than `delta_m` further."""
     along = path_lengths(reference)
     start = np.arange(len(along), dtype=np.int64) if starts is None else starts
     end = np.searchsorted(along, along[start] + delta_m, side="right")
@@ -82,10 +82,21 @@ def pairs_by_metres(reference: F64, delta_m: float, starts: I64 | None = None) -
     return np.stack([start[inside], end[inside]], 1)
 
 
+def within(pairs: I64, parts: I64 | None) -> I64:
+    """The pairs (M, 2) of two poses in one of `parts` (N,), the number of each pose's; None: all are in one."""
+    return pairs if parts is None else pairs[parts[pairs[:, 0]] == parts[pairs[:, 1]]]
+
+
 def path_lengths(poses: F64) -> F64:
     """(N,) metres along the path up to each pose."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def seen_length(poses: F64, parts: I64 | None = None) -> float:
+    """Metres of the path (N, 4, 4) within `parts`, as of `within`."""
+    pairs = within(pairs_by_frames(len(poses), 1), parts)
+    return float(np.linalg.norm(poses[pairs[:, 1], :3, 3] - poses[pairs[:, 0], :3, 3], axis=1).sum())
 
 
 @dataclass(frozen=True)
@@ -99,14 +110,14 @@ class Drift:
     standard: bool  # the benchmark's own lengths, 100 to 800 m
 
 
-def kitti_drift(estimate: F64, reference: F64) -> Drift | None:
-    """KITTI's drift; None for a path too short for any segment.
+def kitti_drift(estimate: F64, reference: F64, parts: I64 | None = None) -> Drift | None:
+    """KITTI's drift; None for a path too short for any segment. `parts` as of `within`.
 
     Segments of 100, 200 .. 800 m start at every tenth frame. A path below 100 m takes 1 to 8 times the largest power of
     ten metres of which it holds at least two (10, 20 .. 80 m for 92 m; 1 and 2 m for 2.7 m): comparable among systems
     on that path, not with the benchmark's numbers.
     """
-    length = float(path_lengths(reference)[-1])
+    length = seen_length(reference, parts)
     if length < SHORTEST_PATH:
         return None
     lengths = KITTI_LENGTHS
@@ -118,7 +129,8 @@ def kitti_drift(estimate: F64, reference: F64) -> Drift | None:
     rotation: list[F64] = []
     used: list[float] = []
     for segment in lengths:
-        metres, radians = relative_errors(estimate, reference, pairs_by_metres(reference, segment, starts))
+        pairs = within(pairs_by_metres(reference, segment, starts), parts)
+        metres, radians = relative_errors(estimate, reference, pairs)
         if len(metres):
             translation.append(metres / segment)
             rotation.append(radians / segment)
@@ -152,12 +164,13 @@ class RetailErrors:
     absolute_translation_m2: float
 
 
-def retail_errors(estimate: F64, reference: F64) -> RetailErrors | None:
-    """The retail paper's errors; None for fewer than two poses."""
-    if len(estimate) < 2:
+def retail_errors(estimate: F64, reference: F64, parts: I64 | None = None) -> RetailErrors | None:
+    """The retail paper's errors; None for fewer than two poses. `parts` as of `within`."""
+    i, j = within(pairs_by_frames(len(estimate), 1), parts).T
+    if not len(i):
         return None
-    motion_estimate = se3.inverse(estimate[:-1]) @ estimate[1:]
-    motion_reference = se3.inverse(reference[:-1]) @ reference[1:]
+    motion_estimate = se3.inverse(estimate[i]) @ estimate[j]
+    motion_reference = se3.inverse(reference[i]) @ reference[j]
     rotation = _equation_23(motion_estimate, motion_reference)
     translation = _equation_24(motion_estimate, motion_reference)
     last_estimate = se3.inverse(estimate[0]) @ estimate[-1]

@@ -78,16 +78,20 @@ def plot_errors(path: Path, evaluations: dict[str, Evaluation]) -> None:
     """Absolute position error and its parts along the axes over time."""
     figure = Figure(figsize=(8, 5))
     top, bottom = figure.subplots(2, sharex=True, gridspec_kw=MARGINS)
+    angles = len(evaluations) > 1 and all(result.oriented for result in evaluations.values())
+    begin_ns = min(result.estimate.stamp_ns[0] for result in evaluations.values())
     for name, result in evaluations.items():
-        seconds = (result.estimate.stamp_ns - result.estimate.stamp_ns[0]) / 1e9
+        seconds = (result.estimate.stamp_ns - begin_ns) / 1e9
         error = 1e3 * (result.estimate.positions - result.reference.positions)
         top.plot(seconds, np.linalg.norm(error, axis=1), label=f"{name}: rmse {1e3 * result.ape_m.rmse:.1f} mm")
-        for axis in range(3) if len(evaluations) == 1 else ():
-            bottom.plot(seconds, error[:, axis], label=AXES[axis], linewidth=1)
-        if len(evaluations) > 1:
+        if angles:
             bottom.plot(seconds, np.degrees(_angles(result)), label=name, linewidth=1)
+        else:
+            of = f"{name}: " if len(evaluations) > 1 else ""
+            for axis in range(3):
+                bottom.plot(seconds, error[:, axis], label=f"{of}{AXES[axis]}", linewidth=1)
     top.set(ylabel="position error [mm]", title="error after alignment")
-    bottom.set(xlabel="time [s]", ylabel="error along axis [mm]" if len(evaluations) == 1 else "rotation error [deg]")
+    bottom.set(xlabel="time [s]", ylabel="rotation error [deg]" if angles else "error along axis [mm]")
     for axes in (top, bottom):
         axes.grid(alpha=0.3)
         axes.legend()

@@ -14,7 +14,7 @@ from stereo_sfm.eval.headline import headline, passed
 from stereo_sfm.eval.html_page import take_plots, to_html
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.sensor_results import sensor_lines
-from stereo_sfm.eval.statistics import failure, loop_errors, summary, thousands
+from stereo_sfm.eval.statistics import failure, loop_errors, summary, thousands, without_images
 from stereo_sfm.types import Trajectory
 
 ADVICE = {
@@ -156,7 +156,7 @@ def _plots_by_name(
 ) -> dict[str, Callable[[], None]]:
     """Functions that draw the plots, by name."""
     drawings: dict[str, Callable[[], None]] = {}
-    aligned = {name: result.estimate for name, result in evaluations.items()}
+    aligned = {name: result.alignment.apply(estimates[name]) for name, result in evaluations.items()}
     shown = aligned or {name: t for name, t in estimates.items() if len(t)}
     if shown:
         truth = next(iter(evaluations.values())).reference if evaluations else None
@@ -212,6 +212,8 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
         )
     if stats["loop_errors_at"]:
         out.append(f"**WARN**: {loop_errors(stats)}")
+    if unseen := without_images(stats):
+        out.append(f"**WARN**: {unseen}")
     out += _drops(stats)
     out += [f"**WARN**: {line}" for line in sensor_lines(stats)]
     if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:

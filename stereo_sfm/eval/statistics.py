@@ -166,6 +166,8 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         lines.append(loop_errors(stats))
     if stats["gravity"]:
         lines.append(_gravity(stats["gravity"]))
+    if unseen := without_images(stats):
+        lines.append(unseen)
     lines += sensor_lines(stats)
     if stats["camera"]:
         lines.append(_camera(stats["camera"]))
@@ -245,6 +247,14 @@ def _loops(stats: dict[str, Any]) -> str:
     )
     drift = stats["closure_drift_percent_median"]
     return text if drift is None else f"{text} · odometry drift at loops {drift:.2f} % of the path (median)"
+
+
+def without_images(stats: dict[str, Any]) -> str:
+    """How many poses the images say nothing about; "" if all rest on them."""
+    count = int(stats["states"].get(TrackState.INERTIAL.name, 0))
+    if not count:
+        return ""
+    return f"{thousands(count)} poses ({100 * count / stats['frames']:.1f} %) rest on IMU or wheels alone"
 
 
 def loop_errors(stats: dict[str, Any]) -> str:

@@ -7,8 +7,10 @@ import logging
 import numpy as np
 import pytest
 
-from stereo_sfm.drivers.ascending import AscendingStamps, ascending
-from stereo_sfm.types import ImuSamples, StereoImage
+from stereo_sfm.drivers.ascending import AscendingSource, AscendingStamps, ascending
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
+from tests.synthetic import pinhole_rig
 
 PERIOD = 100
 
@@ -64,3 +66,17 @@ def test_stamps_ascend_whatever_comes() -> None:
         stamps = [t for given in random.integers(0, 40, 60).tolist() for t in clock.step(given)]
         clock.end()
         assert (np.diff(stamps) > 0).all() and len(stamps) + clock.skipped == 60
+
+
+@pytest.mark.parametrize("back", [350, 100_000])
+def test_a_ground_truth_by_image_goes_on_with_the_images(back: int) -> None:
+    """A line of poses.txt for each image, whose clock was set back."""
+    true = [1_000_000 + PERIOD * k for k in range(12)]
+    given = true[:6] + [t - back for t in true[6:]]
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    poses[:, 0, 3] = np.arange(12)
+    source = MemorySource(pinhole_rig(), [image(k, t) for k, t in enumerate(given)])
+    source.ground_truth = Trajectory(np.array(given, np.int64), poses)
+    truth = AscendingSource(source).ground_truth
+    assert truth is not None and truth.stamp_ns.tolist() == true
+    assert truth.positions[:, 0].tolist() == list(range(12))

@@ -151,3 +151,10 @@ def test_two_nodes_one_killed_during_the_run(tmp_path: Path) -> None:
     finally:
         ray.shutdown()
         cluster.shutdown()
+
+
+def test_a_run_that_failed_is_no_good_recording() -> None:
+    good = {"ok": True, "stats": {}, "failure": ""}
+    assert batch.why_failed(good) == "" and batch.why_failed({"ok": True, "stats": {}}) == ""
+    assert batch.why_failed({**good, "failure": "40 % of the frames have no pose"}).startswith("40 %")
+    assert batch.why_failed({"ok": False, "error": "line\nno images"}) == "no images"

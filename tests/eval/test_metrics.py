@@ -142,3 +142,35 @@ def test_relative_errors_over_metres() -> None:
 
 def test_lengths_for_people() -> None:
     assert [length(v) for v in (0.0046, 0.449, 91.97, float("nan"))] == ["4.60 mm", "0.449 m", "92.0 m", "not defined"]
+
+
+def test_a_truth_with_a_hole_tells_nothing_of_the_way_across() -> None:
+    """Motion capture at both ends of a corridor: 400 m of drift are not that of the metre that is seen."""
+    truth = trajectory(straight(1000, 0.5, turn=0.002))
+    estimate = trajectory(straight(1000, 0.5, turn=0.0021))
+    seen = np.r_[0:100, 900:1000]
+    parts = Trajectory(truth.stamp_ns[seen], truth.poses[seen])
+    result = evaluate(estimate, parts)
+    assert result.length_m == pytest.approx(99.0) and (result.frames, result.of_frames) == (200, 1000)
+    assert result.drift is not None and result.drift.translation_percent < 1.0
+    assert result.rpe_m.count == 198 and result.rpe_m.max < 1e-3
+    assert "200 of 1000 frames over 99.0 m" in dict(table(result))["compared"]
+    assert evaluate(estimate, truth).rpe_m.count == 999
+
+
+def test_relative_errors_have_the_scale_of_the_alignment() -> None:
+    truth = trajectory(straight(200, 0.5, turn=0.02))
+    poses = truth.poses.copy()
+    poses[:, :3, 3] *= 0.1  # of one camera
+    result = evaluate(trajectory(poses), truth, "sim3")
+    assert result.rpe_m.rmse < 1e-6 and result.drift is not None and result.drift.translation_percent < 1e-3
+
+
+def test_a_slow_reference_is_compared_with_the_nearest_poses() -> None:
+    """A total station once a second: each of its poses once, not with thirty of the estimate."""
+    estimate = trajectory(straight(301, 0.1, turn=0.01))
+    slow = Trajectory(estimate.stamp_ns[5::10] + 3_000_000, estimate.poses[5::10])
+    with pytest.raises(StereoSfmError, match="a pose every 1 s, --t-max-diff compares the nearest"):
+        evaluate(estimate, slow)
+    result = evaluate(estimate, slow, interpolate=False, max_difference_ns=500_000_000)
+    assert result.frames == 30 and result.ape_m.rmse < 1e-6
