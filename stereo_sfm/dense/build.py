@@ -29,12 +29,13 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import MODELS
 from stereo_sfm.input_file import read_bytes
-from stereo_sfm.maps.floor import HIGH, LOW, find_floor
+from stereo_sfm.maps.floor import HIGH, LOW
 from stereo_sfm.types import F64, U8, Bool
 
 T = TypeVar("T")
 R = TypeVar("R")
-VERSION = "6"  # of the files: grows when the same input gives other bits
+VERSION = "7"  # of the files: grows when the same input gives other bits
+PLACE = 1e-5  # metres, radians: keyframes that moved by less show the same
 CubeIndex = tuple[int, int, int]
 Bands = tuple[tuple[float, float], ...]  # of heights above the floor, metres
 ROBOT: Bands = ((LOW, HIGH),)
@@ -52,8 +53,9 @@ class KeptDepth:
     reach: float  # metres
 
     def place_key(self) -> str:
-        """Changes with the image or its pose."""
-        return self.key + hashlib.sha256(self.floor_T_cam.tobytes()).hexdigest()
+        """Changes with the image, its session or its pose, as far as a map that is saved again does not."""
+        pose = np.rint(self.floor_T_cam / PLACE).astype(np.int64)
+        return f"{self.key}{self.session}" + hashlib.sha256(pose.tobytes()).hexdigest()
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,7 @@ class Volume:
     indices: list[CubeIndex]  # in order
     voxel: float  # metres
     map_T_floor: F64  # (4, 4)
+    base_T_left: F64  # (4, 4) of the newest session's rig
 
     def surfaces(self) -> Iterator[Surface]:
         """Of each cube that has one."""
@@ -97,7 +100,7 @@ def build(given: DenseInput, folder: Path, voxel: float, jobs: int, report: Repo
     Raises:
         StereoSfmError: no keyframe has depth, or none that is precise enough for such voxels.
     """
-    map_T_floor = find_floor(given.saved.snapshot)
+    map_T_floor = given.map_T_floor
     for name in ("depth", "cubes"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     with _Workers(jobs) as workers:
@@ -111,8 +114,9 @@ def build(given: DenseInput, folder: Path, voxel: float, jobs: int, report: Repo
         tasks = ((c, views, folder / "cubes", voxel) for c, views in zip(cubes, seen_by, strict=True))
         for number, _ in enumerate(workers.map(_cube, tasks), 1):
             report("cubes", number, len(cubes))
+    _remove_others(folder / "depth", {k.path.name for k in kept})
     _remove_others(folder / "cubes", {_cube_name(c) for c in cubes})
-    return Volume(folder / "cubes", cubes, voxel, map_T_floor)
+    return Volume(folder / "cubes", cubes, voxel, map_T_floor, given.saved.rig.base_T_left)
 
 
 class _Workers:
@@ -198,7 +202,7 @@ def _depth_key(now: KeyframeImages, others: list[KeyframeImages]) -> str:
     digest.update(rig_to_text(now.rig).encode())
     for other in others:
         motion = se3.inverse(now.map_T_cam) @ other.map_T_cam
-        digest.update(np.rint(motion * 1e5).astype(np.int64).tobytes())
+        digest.update(np.rint(motion / PLACE).astype(np.int64).tobytes())
     return digest.hexdigest()
 
 
@@ -269,7 +273,7 @@ def _columns(voxels: U8, height: F64, bands: Bands) -> Bool:
 
 
 def _remove_others(folder: Path, names: set[str]) -> None:
-    """Files of cubes in which nothing is any more."""
+    """Files of keyframes and cubes in which nothing is any more."""
     for path in sorted(folder.glob("*.npz")):
         if path.name not in names:
             path.unlink()

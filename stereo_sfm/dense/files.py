@@ -19,7 +19,7 @@ from stereo_sfm.dense.pictures import height_colours, write_mesh_pictures
 from stereo_sfm.dense.surface import Numbering, Surface
 from stereo_sfm.dense.volume import SIDE
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, write_floor_plan
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan, in_robots_map, write_floor_plan
 from stereo_sfm.input_file import read_bytes
 from stereo_sfm.maps.floor import HIGH
 from stereo_sfm.types import F32, F64, I32, I64, U8
@@ -34,7 +34,8 @@ LAS_POINT = np.dtype([
 PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("colour", "u1", 3)])
 PLY_FACE = np.dtype([("n", "u1"), ("i", "<i4", 3)])
 FILES = (
-    "mesh.ply, mesh.glb, cloud.ply, cloud.las, costmap.png, costmap.yaml, height.png, mesh_height.png, mesh_grey.png"
+    "mesh.ply, mesh.glb, cloud.ply, cloud.las, costmap.png, costmap.yaml, nav2_costmap.pgm, nav2_costmap.yaml, "
+    "height.png, mesh_height.png, mesh_grey.png"
 )
 
 
@@ -94,8 +95,8 @@ def _chunks(file: IO[bytes], kind: Any) -> Iterator[Any]:
 def write_all(volume: Volume, folder: Path, bands: Bands = ROBOT) -> dict[str, float]:
     """Write `FILES`, and a costmap for each further band of heights; returns numbers about them.
 
-    All are in the floor's frame of `costmap.yaml` (`map_T_floor`): metres, z up, z = 0 on the floor. Memory does not
-    depend on the number of cubes, apart from the pictures' pixels.
+    All but Nav2's are in the floor's frame of `costmap.yaml` (`map_T_floor`): metres, z up, z = 0 on the floor. Memory
+    does not depend on the number of cubes, apart from the pictures' pixels.
     """
     with joined(volume, folder) as mesh:
         write_mesh_ply(folder / "mesh.ply", mesh)
@@ -106,6 +107,7 @@ def write_all(volume: Volume, folder: Path, bands: Bands = ROBOT) -> dict[str, f
             write_floor_plan(plan, folder / ("costmap" if number == 0 else f"costmap_{low:.2f}_{high:.2f}"))
             if number == 0:
                 write_heights(folder / "height.png", mesh, plan)
+                write_floor_plan(in_robots_map(plan, volume.base_T_left), folder / "nav2_costmap.pgm")
         points = (v["xyz"].astype(np.float64) for v in mesh.vertices())
         write_mesh_pictures(folder, points, _parts_of(volume), mesh.heights())
         return {
@@ -240,7 +242,7 @@ def costmaps(volume: Volume, bands: Bands) -> list[FloorPlan]:
         part = images[:, x : x + SIDE, y : y + SIDE]
         part[free & (part == UNKNOWN)] = FREE
         part[occupied] = OCCUPIED
-    origin = (low * SIDE * volume.voxel).tolist()
+    origin = ((low * SIDE - 0.5) * volume.voxel).tolist()  # a voxel is a place, the middle of its pixel
     place = (origin[0], origin[1]), volume.map_T_floor
     return [FloorPlan(np.ascontiguousarray(image.T[::-1]), volume.voxel, *place) for image in images]
 

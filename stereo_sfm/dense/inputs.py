@@ -12,7 +12,10 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.keyframe_images import open_recording, session_of_recording
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
+from stereo_sfm.maps.floor import find_floor
 from stereo_sfm.maps.saved_map import SavedMap, load_map
+from stereo_sfm.maps.store import read_about
+from stereo_sfm.types import F64
 
 RUN_LOG, RUN_MAP = "run.mcap", "map"
 
@@ -25,6 +28,18 @@ class DenseInput:
     recordings: tuple[str, ...]
     rig: Path | None  # calibration of the recordings instead of their own
     run: Path | None = None  # folder of the run over them, if it is known
+    store: Path | None = None  # folder of the map
+
+    @property
+    def map_T_floor(self) -> F64:
+        """(4, 4) the floor's frame: a store's own, in which its plans and labels are.
+
+        Raises:
+            StereoSfmError: the store's description is damaged, or the vertical direction is not known.
+        """
+        if self.store is not None:
+            return read_about(self.store, self.saved).map_T_floor
+        return find_floor(self.saved.snapshot, self.saved.rig.base_T_left[2, :3])
 
 
 def find_input(folder: Path, images: Sequence[str] = (), rig: Path | None = None) -> DenseInput:
@@ -38,7 +53,7 @@ def find_input(folder: Path, images: Sequence[str] = (), rig: Path | None = None
     place = folder / RUN_MAP if (folder / RUN_MAP / "map.json").is_file() else folder
     saved = load_map(place)
     recordings = tuple(images) or _own_images(folder)
-    return DenseInput(saved, recordings, rig, folder)
+    return DenseInput(saved, recordings, rig, folder, place)
 
 
 def _own_images(folder: Path) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ class FloorPlan:
     image: U8  # (H, W) FREE, OCCUPIED or UNKNOWN
     resolution: float  # metres per pixel
     origin: tuple[float, float]  # metres, lower left corner of the image in the floor frame
-    map_T_floor: F64  # (4, 4) floor frame: x and y along the aisles and across, z up, z = 0 on the floor
+    map_T_floor: F64  # (4, 4) floor frame: x and y along the aisles and across, z up, z = 0 on the floor (or a robot's)
 
 
 def make_floor_plan(s: MapSnapshot, resolution: float = 0.05, map_T_floor: F64 | None = None) -> FloorPlan:
@@ -105,6 +105,46 @@ def _trace(start, end, low, resolution, passed):
                 last_x, last_y = x, y
 
 
+def turned(image: U8, resolution: float, origin: tuple[float, float], map_T_floor: F64, border: int) -> tuple[U8, F64]:
+    """A picture from above in the axes of the map, the first row with the least y; its corner with the least x and y.
+
+    Args:
+        image: (H, W) or (H, W, C); the last row has the least y.
+        resolution: metres per pixel.
+        origin: metres, corner with the least x and y in the floor's frame.
+        map_T_floor: (4, 4) the floor in the robot's map.
+        border: around it.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    size = np.array([width, height]) * resolution
+    corners = np.array([[origin[0] + x, origin[1] + y, 0.0] for x in (0.0, size[0]) for y in (0.0, size[1])])
+    outline = se3.transform(map_T_floor, corners)
+    low = np.floor(outline[:, :2].min(0) / resolution) * resolution
+    columns, rows = np.ceil((outline[:, :2].max(0) - low) / resolution).astype(int)
+    yaw = np.arctan2(map_T_floor[1, 0], map_T_floor[0, 0])
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])  # map -> floor
+    start = turn @ (low - map_T_floor[:2, 3]) - origin
+    into_floor = np.column_stack([turn, start / resolution + (turn.sum(1) - 1) / 2])
+    flat = cv2.warpAffine(
+        image[::-1], into_floor, (int(columns), int(rows)), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
+        borderValue=[border] * 4,
+    )  # fmt: skip
+    return flat.astype(np.uint8), np.array([*low, outline[:, 2].mean()])
+
+
+def in_robots_map(plan: FloorPlan, base_T_left: F64, border: int = UNKNOWN) -> FloorPlan:
+    """A plan in the axes of the poses that robots get, as `map_server` takes it: Nav2 takes no grid that is turned.
+
+    Args:
+        base_T_left: (4, 4) of the rig. border: around the plan.
+    """
+    image, corner = turned(plan.image, plan.resolution, plan.origin, base_T_left @ plan.map_T_floor, border)
+    place = (float(corner[0]), float(corner[1])), se3.inverse(base_T_left)
+    return FloorPlan(np.ascontiguousarray(image[::-1]), plan.resolution, *place)
+
+
 def plan_files(path: Path) -> tuple[Path, Path]:
     """PATH.png and PATH.yaml, or PATH.pgm; `path` may have a suffix, any other dot is part of the name."""
     ending = ".pgm" if path.suffix == ".pgm" else ".png"
@@ -140,6 +180,7 @@ def write_floor_plan(plan: FloorPlan, path: Path) -> None:
 
 def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> FloorPlan:
     """Make the floor plan of a map and write it."""
-    plan = make_floor_plan(saved.snapshot, resolution)
+    map_T_floor = find_floor(saved.snapshot, saved.rig.base_T_left[2, :3])
+    plan = make_floor_plan(saved.snapshot, resolution, map_T_floor)
     write_floor_plan(plan, path)
     return plan

@@ -9,7 +9,7 @@ import yaml
 
 from stereo_sfm.export.doors import plan_doors
 from stereo_sfm.export.floor_plan import make_floor_plan, write_floor_plan
-from stereo_sfm.export.keep_out import read_zones, write_zones
+from stereo_sfm.export.keep_out import covering, read_zones, write_zones
 from stereo_sfm.export.shelf_fronts import shelf_fronts
 from stereo_sfm.maps.store import load_current, lock_about, read_about, write_about
 
@@ -23,10 +23,10 @@ def write_store_plan(store: Path, resolution: float = RESOLUTION_M) -> str:
         saved = load_current(store)
         about = read_about(store, saved)
         write_about(store, about)  # the frame of the drawing
-        plan = make_floor_plan(saved.snapshot, resolution, about.map_T_floor)
+        plan = covering(make_floor_plan(saved.snapshot, resolution, about.map_T_floor), store)
         zones = read_zones(store, plan)
         write_floor_plan(plan, store / PLAN)
-        write_zones(store, plan, zones)
+        write_zones(store, plan, zones, saved.rig.base_T_left)
         fronts = shelf_fronts(plan, about.aisles)
         doors = plan_doors(plan, about.doors)
         _write_rows(

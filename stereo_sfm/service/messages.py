@@ -38,6 +38,11 @@ class Status:
     map_is_new: bool = False  # the saved map begins with this session, and so has the frame of its poses
     session: int = 0  # pipelines started so far
 
+    @property
+    def in_saved_map(self) -> bool:
+        """Whether the poses are in the frame of the saved map, and so its floor plan lies where it shows."""
+        return self.localized or self.map_is_new
+
 
 @dataclass(frozen=True, eq=False)
 class Started(Message):

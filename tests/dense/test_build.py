@@ -51,7 +51,7 @@ def drive(steps: int = 3, right: bool = True) -> list[KeyframeImages]:
 
 
 class _Saved:
-    snapshot, sessions = None, np.zeros(3, np.int64)
+    snapshot, sessions, rig = None, np.zeros(3, np.int64), pinhole_rig()
 
     def __len__(self) -> int:
         return 3
@@ -62,9 +62,8 @@ class Case:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.frames, self.made = drive(), 0
-        self.given: Any = SimpleNamespace(saved=_Saved())
+        self.given: Any = SimpleNamespace(saved=_Saved(), map_T_floor=FLOOR)
         monkeypatch.setattr(module, "keyframes", self._keyframes)
-        monkeypatch.setattr(module, "find_floor", lambda _: FLOOR)
         monkeypatch.setattr(module, "fuse", self._fuse)
 
     def _keyframes(self, _: object) -> Iterator[KeyframeImages]:

@@ -62,11 +62,10 @@ def test_map_server_reads_each_place_as_it_was_seen(tmp_path: Path) -> None:
     )
     write_floor_plan(costmaps(volume, ROBOT)[0], tmp_path / "costmap_0.10_0.60")
     server = MapServer(tmp_path / "costmap_0.10_0.60.yaml")
-    half = 0.5 * VOXEL
-    for x in (0.0, 1.0, 3.15):
-        assert server.at(x + half, 1.0 + half) == OCCUPIED
-        assert server.at(x + half, 0.95 + half) == FREE
-        assert server.at(x + half, 1.05 + half) == UNKNOWN
-    assert server.at(-0.2 + half, -0.1 + half) == OCCUPIED
+    for x in (0.0, 1.0, 3.15):  # where the voxels are
+        assert server.at(x, 1.0) == OCCUPIED
+        assert server.at(x, 0.95) == FREE
+        assert server.at(x, 1.05) == UNKNOWN
+    assert server.at(-0.2, -0.1) == OCCUPIED
     assert (server.grid == OCCUPIED).sum() == SIDE + 1
     assert server.grid.shape == (2 * SIDE, 2 * SIDE) and server.resolution == VOXEL

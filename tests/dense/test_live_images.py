@@ -37,6 +37,12 @@ def test_walls_are_obstacles_and_the_floor_is_not(rig: Rig) -> None:
     v, u = np.nonzero(live.depth_mm)
     depth = live.depth_mm[v, u] / 1000.0
     points = np.stack([(u - cx) / fx * depth, (v - cy) / fy * depth, depth], axis=1)
+    seen = live.points(3)
+    uv = seen[:, :2] / seen[:, 2:] * live.pinhole[:2] + live.pinhole[2:]
+    np.testing.assert_allclose(uv, np.rint(uv), atol=1e-6)
+    column, row = np.rint(uv).astype(int).T
+    np.testing.assert_array_equal(np.rint(1000 * seen[:, 2]), live.depth_mm[row, column])
+    assert len(seen) == (live.depth_mm[::3, ::3] > 0).sum()
     off = np.min([np.abs(points[:, axis] - place) for axis, place in WALLS], axis=0)
     assert len(points) > 0.6 * live.depth_mm.size
     assert np.median(off / depth) < 0.04, "on the surfaces, by its own camera"

@@ -73,7 +73,7 @@ def test_memory_does_not_depend_on_the_number_of_cubes(
     place.mkdir()
     distance = np.broadcast_to(np.arange(n, dtype=np.float32) - 30.4, (n, n, n)).copy()
     seen, grey = np.full((n, n, n), 2, np.float32), np.full((n, n, n), 77, np.float32)
-    volume = Volume(place, [(k, 0, 0) for k in range(cubes)], VOXEL, np.eye(4))
+    volume = Volume(place, [(k, 0, 0) for k in range(cubes)], VOXEL, np.eye(4), np.eye(4))
     for index in volume.indices:
         columns = vars(extract(Cube(index, distance, seen, seen, grey)))
         write_arrays(place / f"{index[0]}_0_0.npz", columns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,19 @@ import yaml
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN
-from stereo_sfm.export.keep_out import ABOUT, DRAWING, read_zones, write_zones
+from stereo_sfm.export.keep_out import ABOUT, DRAWING, covering, read_zones, write_zones
 from stereo_sfm.export.shelf_fronts import shelf_fronts
+from stereo_sfm.geometry import se3
 from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.saved_map import save_map
 from tests.export.plans import fill, plan_of
 from tests.maps.maps import small_map
+from tests.synthetic import pinhole_rig
 
 
 def test_zones_drawn_by_hand_stay_where_they_are_when_the_plan_grows(tmp_path: Path) -> None:
     plan = plan_of(6.0, 4.0, (-1.0, -2.0))
-    write_zones(tmp_path, plan, read_zones(tmp_path, plan))
+    write_zones(tmp_path, plan, read_zones(tmp_path, plan), np.eye(4))
     picture: Any = cv2.imread(str(tmp_path / DRAWING))
     assert picture.shape == (80, 120, 3)
     # 2 to 3 m along x, 0.5 to 1.5 m along y: as a person draws, in a red of their own
@@ -37,7 +40,8 @@ def test_zones_drawn_by_hand_stay_where_they_are_when_the_plan_grows(tmp_path: P
         xs, ys = (grown.origin[0] + columns * grown.resolution), (grown.origin[1] + rows * grown.resolution)
         assert (xs.min(), ys.min()) == pytest.approx((2.0, 0.5), abs=0.01)
         assert (xs.max() + grown.resolution, ys.max() + grown.resolution) == pytest.approx((3.0, 1.5), abs=0.01)
-    write_zones(tmp_path, plan_of(9.0, 8.0, (-2.5, -4.0)), read_zones(tmp_path, plan_of(9.0, 8.0, (-2.5, -4.0))))
+    grown = plan_of(9.0, 8.0, (-2.5, -4.0))
+    write_zones(tmp_path, grown, read_zones(tmp_path, grown), np.eye(4))
     assert (read_zones(tmp_path, plan) == zones).all()
     mask = cv2.imread(str(tmp_path / "keepout_mask.pgm"), cv2.IMREAD_GRAYSCALE)
     about = yaml.safe_load((tmp_path / "keepout_mask.yaml").read_text())
@@ -45,9 +49,39 @@ def test_zones_drawn_by_hand_stay_where_they_are_when_the_plan_grows(tmp_path: P
     assert about["origin"] == [-2.5, -4.0, 0.0] and about["image"] == "keepout_mask.pgm"
 
 
+def test_zones_beyond_a_plan_that_shrank_stay(tmp_path: Path) -> None:
+    plan, smaller = plan_of(6.0, 4.0, (-1.0, -2.0)), plan_of(2.0, 2.0, (-1.0, -2.0))
+    zones = np.zeros(plan.image.shape, bool)
+    zones[5:10, 100:110] = True  # at the upper right
+    write_zones(tmp_path, plan, zones, np.eye(4))
+    covered = covering(smaller, tmp_path)
+    assert covered.origin == smaller.origin and (covered.image[-40:, :40] == smaller.image).all()
+    write_zones(tmp_path, covered, read_zones(tmp_path, covered), np.eye(4))
+    assert (read_zones(tmp_path, plan) == zones).all()
+
+
+def test_the_mask_lies_where_robots_think_they_are(tmp_path: Path) -> None:
+    """Nav2 loads it beside the service's poses: the first robot's pose is its origin, its axes those of the robot."""
+    base_T_left = pinhole_rig().base_T_left
+    floor = se3.exp(np.array([3.0, -1.1, -0.4, 0.0, 0.0, 0.7]))  # in the robot's map
+    plan = replace(plan_of(6.0, 4.0, (-1.0, -2.0)), map_T_floor=se3.inverse(base_T_left) @ floor)
+    zones = np.zeros(plan.image.shape, bool)
+    zones[40:50, 60:70] = True
+    write_zones(tmp_path, plan, zones, base_T_left)
+    about = yaml.safe_load((tmp_path / "keepout_mask.yaml").read_text())
+    mask = cv2.imread(str(tmp_path / "keepout_mask.pgm"), cv2.IMREAD_GRAYSCALE)
+    assert mask is not None
+    rows, columns = np.nonzero(mask[::-1] == OCCUPIED)
+    seen = np.array(about["origin"][:2]) + (np.array([columns.mean(), rows.mean()]) + 0.5) * about["resolution"]
+    rows, columns = np.nonzero(zones[::-1])
+    middle = np.array(plan.origin) + (np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution
+    there = se3.transform(floor, np.array([[*middle, 0.0]]))[0]
+    assert np.linalg.norm(seen - there[:2]) < plan.resolution
+
+
 def test_a_drawing_of_unknown_place_is_refused(tmp_path: Path) -> None:
     plan = plan_of(2.0, 2.0, (0.0, 0.0))
-    write_zones(tmp_path, plan, np.zeros(plan.image.shape, bool))
+    write_zones(tmp_path, plan, np.zeros(plan.image.shape, bool), np.eye(4))
     (tmp_path / ABOUT).unlink()
     with pytest.raises(StereoSfmError, match="does not say where"):
         read_zones(tmp_path, plan)

@@ -15,7 +15,7 @@ import pytest
 from stereo_sfm.geometry import se3
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.link import OutputProcess
-from stereo_sfm.service.messages import ServiceState
+from stereo_sfm.service.messages import ServiceState, Status
 from stereo_sfm.service.outputs import dds_memory, ros2
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.ros2 import SERVICES, Ros2Output
@@ -97,6 +97,7 @@ def test_nodes_receive_poses_cloud_path_and_plan() -> None:
         output.put(cloud(300, 4))
         plan = np.full((20, 30), 254, np.uint8)
         output._take_plan(plan, 0.1, (0.0, 0.0), np.diag([1.0, -1, -1, 1]))  # pyright: ignore[reportPrivateUsage]
+        output.put(Status(ServiceState.RUNNING, localized=True, session=started().session))
 
         def received() -> bool:
             output.put(update)
@@ -131,6 +132,7 @@ def test_a_floor_plan_that_is_ready_before_the_camera_is_published_with_it() -> 
         plan = np.full((20, 30), 254, np.uint8)
         output._take_plan(plan, 0.1, (0.0, 0.0), np.diag([1.0, -1, -1, 1]))  # pyright: ignore[reportPrivateUsage]
         output.put(started())
+        output.put(Status(ServiceState.RUNNING, map_is_new=True, session=started().session))
         listener.until(lambda: bool(listener.got["floor_plan"]))
     finally:
         output.close()
@@ -144,7 +146,8 @@ def test_nodes_receive_depth_and_obstacles() -> None:
 
     sent = live_depth(3)
     with _talking() as (output, listener):
-        for topic, kind in (("depth", Image), ("camera_info", CameraInfo), ("obstacles", PointCloud2)):
+        kinds = {"depth": Image, "camera_info": CameraInfo, "obstacles": PointCloud2, "seen": PointCloud2}
+        for topic, kind in kinds.items():
             listener.got[topic] = []
             listener.node.create_subscription(kind, topic, listener.got[topic].append, qos_profile_sensor_data)
         output.put(pose_update(2))
@@ -165,6 +168,8 @@ def test_nodes_receive_depth_and_obstacles() -> None:
     points = np.frombuffer(cloud_.data, "<f4").reshape(-1, 3)
     expected = [[p[2], -p[0], -p[1]] for p in sent.obstacles]  # the camera looks ahead
     np.testing.assert_allclose(points, expected, atol=1e-6)
+    seen = np.frombuffer(listener.got["seen"][0].data, "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(seen, [[p[2], -p[0], -p[1]] for p in sent.points(ros2.SEEN_PX)], atol=1e-6)
 
 
 def test_an_unknown_velocity_is_zero_with_a_large_variance_and_the_camera_clock_is_simulated_time() -> None:

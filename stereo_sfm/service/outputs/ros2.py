@@ -12,8 +12,11 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from stereo_sfm.drivers.ros2.this_computer import keep_here
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.floor_plan import UNKNOWN
 from stereo_sfm.service.messages import HealthReport, MapCloud, PoseUpdate, ServiceMessage, Started, Status
 from stereo_sfm.service.outputs import dds_memory
 from stereo_sfm.service.outputs.floor_grid import FloorGrids, RawPlan, aligned
@@ -36,6 +39,7 @@ PARAMETERS = {
     "mark_text": (("mark", "text"),),
 }
 REPLY_S = 60.0
+SEEN_PX = 4  # px of the depth image between the points of `seen`: 2 cm at 2 m, less than a cell of a costmap
 LEFT_FRAME, RIGHT_FRAME = "left_optical", "right_optical"
 NEEDS = (
     "the ROS 2 output needs rclpy: source ROS's setup.bash in an environment with --system-site-packages, "
@@ -69,6 +73,8 @@ class Ros2Output:
         self._clock_ns = 0  # wall clock minus the camera's
         self._plans = FloorGrids(self._take_plan)
         self._plan: RawPlan | None = None  # the newest
+        self._in_saved_map = self._plan_sent = False
+        self._session = 0
         self._topics: dict[str, Any] = {}
         self._node: Any = None
         self._lock = threading.Lock()
@@ -143,6 +149,7 @@ class Ros2Output:
             ("depth", Image, qos_profile_sensor_data),
             ("camera_info", CameraInfo, qos_profile_sensor_data),
             ("obstacles", PointCloud2, qos_profile_sensor_data),
+            ("seen", PointCloud2, qos_profile_sensor_data),
         ]
         if self._has("diagnostic_msgs", "diagnostics"):
             from diagnostic_msgs.msg import DiagnosticArray
@@ -188,6 +195,8 @@ class Ros2Output:
 
     def _started(self, started: Started) -> None:
         self._axes = RobotAxes(started.rig)
+        self._in_saved_map &= started.session == self._session  # else its frame is its own until the map is recognised
+        self._session = started.session
         self._publish_plan()
         if "/tf_static" not in self._topics:
             return
@@ -231,7 +240,7 @@ class Ros2Output:
         self._topics["path"].publish(ros.path(stamp, frame, self._axes.cameras(cloud.map_T_kf)))
 
     def _depth(self, live: LiveDepth) -> None:
-        """Depth in the left camera, obstacles in the robot's frame."""
+        """Depth in the left camera; obstacles, and all that is seen, which clears them, in the robot's frame."""
         from stereo_sfm.service.outputs import ros2_messages as ros
 
         if self._axes is None:
@@ -239,8 +248,9 @@ class Ros2Output:
         stamp = live.stamp_ns if self._config.use_sim_time else live.stamp_ns + self._clock_ns
         self._topics["depth"].publish(ros.depth_image(stamp, LEFT_FRAME, live.depth_mm))
         self._topics["camera_info"].publish(ros.camera_info(stamp, LEFT_FRAME, live))
-        points = self._axes.points(live.obstacles.astype(float))
-        self._topics["obstacles"].publish(ros.cloud(stamp, self._config.base_frame, points))
+        for topic, points in (("obstacles", live.obstacles.astype(float)), ("seen", live.points(SEEN_PX))):
+            there = self._axes.points(points)
+            self._topics[topic].publish(ros.cloud(stamp, self._config.base_frame, there))
 
     def _take_health(self, health: HealthReport) -> None:
         self._health = health
@@ -249,6 +259,9 @@ class Ros2Output:
         from stereo_sfm.service.outputs import ros2_messages as ros
 
         self._plans.follow(status)
+        if status.session == self._session and status.in_saved_map != self._in_saved_map:
+            self._in_saved_map = status.in_saved_map
+            self._publish_plan()
         if "/diagnostics" in self._topics:
             self._topics["/diagnostics"].publish(ros.diagnostics(self._now(), status, self._health))
 
@@ -259,12 +272,14 @@ class Ros2Output:
             self._publish_plan()
 
     def _publish_plan(self) -> None:
-        """The floor plan in the axes of the poses, once both are known."""
+        """The floor plan in the axes of the poses, once both are known; unknown floor where they have another frame."""
         from stereo_sfm.service.outputs import ros2_messages as ros
 
-        if self._axes is None or self._plan is None:
+        if self._axes is None or self._plan is None or not (self._in_saved_map or self._plan_sent):
             return
         image, resolution, origin, map_T_floor = self._plan
+        image = image if self._in_saved_map else np.full_like(image, UNKNOWN)
+        self._plan_sent = self._in_saved_map
         plan = aligned(image, resolution, origin, self._axes.in_map(map_T_floor))
         self._topics["floor_plan"].publish(ros.grid(self._now(), self._config.map_frame, plan))
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stereo_sfm.export.floor_plan import turned
 from stereo_sfm.input_file import read_bytes, read_yaml
-from stereo_sfm.service.outputs.floor_grid import turned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.types import U8
 
