@@ -96,8 +96,8 @@ def rectify(
     rect_R_left, rect_R_right = rectifying_rotations(rig.left_T_right)
     choose = pinhole_camera if projection == "pinhole" else epipolar_camera
     camera = choose(rig.left, second, rect_R_left, rect_R_right, hfov_deg, size)
-    left = _rectified(rig.left, rig.left_mask, camera, rect_R_left)
-    right = _rectified(second, rig.right_mask, camera, rect_R_right)
+    left = camera_rectification(rig.left, rig.left_mask, camera, rect_R_left)
+    right = camera_rectification(second, rig.right_mask, camera, rect_R_right)
     cam_T_rect = se3.from_rotation_translation(rect_R_left.T, np.zeros(3))
     baseline = se3.from_rotation_translation(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
     new = replace(
@@ -115,7 +115,9 @@ def rectify(
     return Rectification(new, left, right, cam_T_rect)
 
 
-def _rectified(source: Camera, used: Bool | None, target: Camera, target_R_source: F64) -> CameraRectification:
+def camera_rectification(
+    source: Camera, used: Bool | None, target: Camera, target_R_source: F64
+) -> CameraRectification:
     """The tables of one camera; what `used` (H, W) does not cover has no source."""
     found = CameraRectification(source, target, target_R_source, *remap_tables(source, target, target_R_source))
     if used is None:

@@ -96,7 +96,7 @@ def keyframe_depth(now: KeyframeImages, others: Iterable[KeyframeImages]) -> Dep
         found.append(pair_depth(_pair_view(rig, scale), now.left, now.right, STEP))
     for other in others:
         now_T_other = se3.inverse(now.map_T_cam) @ other.map_T_cam
-        view = motion_view(rig.left, other.rig.left, now_T_other, scale * rig.left.fx)
+        view = motion_view(rig, other.rig, now_T_other, scale * rig.left.fx)
         if view is not None:
             found.append(pair_depth(view, now.left, other.left, STEP))
     return joined(found) if found else None

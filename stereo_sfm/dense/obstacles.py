@@ -9,7 +9,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import DenseConfig
 from stereo_sfm.geometry.preintegration import GRAVITY
-from stereo_sfm.maps.floor import floor_level
+from stereo_sfm.maps.floor import BELOW_M, floor_level
 from stereo_sfm.types import F32, F64, ImuSamples
 
 CELL_M = 0.05  # side of the cells that get one point each: that of Nav2's costmaps
@@ -36,8 +36,9 @@ def upwards(rig: Rig, imu: ImuSamples | None) -> F64:
 
 
 def mounted_height(rig: Rig, config: DenseConfig) -> float:
-    """Metres of the left camera above the floor, 0 where unknown."""
-    return config.camera_height_m or max(float(rig.body_T_left[2, 3]), 0.0)
+    """Metres of the left camera above the floor, 0 where unknown: a body beside the camera is its IMU or itself."""
+    above_body = float(rig.body_T_left[2, 3])
+    return config.camera_height_m or (above_body if above_body > BELOW_M else 0.0)
 
 
 def obstacles(ranges: F32, sigmas: F32, rays: F32, up: F64, height: float, config: DenseConfig) -> F32:

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereo_sfm.calib.rectification import Rectification, rectify
+from stereo_sfm.calib.rectification import CameraRectification, camera_rectification, rectify
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.cameras import Camera, Epipolar, Pinhole
-from stereo_sfm.geometry.rectify import remap_tables
 from stereo_sfm.types import F32, F64, I64, U8, Bool
 
 WIDE_DEG = 120.0  # a pinhole image of a wider view is mostly stretched border (as geometry/rectify.py)
@@ -104,18 +103,19 @@ def stereo_view(rig: Rig, scale: float = 1.0) -> PairView:
     rectified = rectify(rig, "pinhole" if _is_narrow(rig.left) else "epipolar", None if _is_narrow(rig.left) else 150.0)
     camera, nearest = scaled(rectified.rig.left, scale), NEAREST_BASELINES * rig.baseline
     if camera is not rectified.rig.left:
-        rotations = rectified.left.target_R_source, rectified.right.target_R_source
         assert rig.right is not None
-        parts = [_resampling(*args) for args in ((rig.left, camera, rotations[0]), (rig.right, camera, rotations[1]))]
-        return PairView(camera, rectified.cam_T_rect[:3, :3], rig.baseline, nearest, parts[0], parts[1])
-    return PairView(camera, rectified.cam_T_rect[:3, :3], rig.baseline, nearest, *_both(rectified))
+        left = _resampling(rig.left, rig.left_mask, camera, rectified.left.target_R_source)
+        right = _resampling(rig.right, rig.right_mask, camera, rectified.right.target_R_source)
+    else:
+        left, right = _tables(rectified.left), _tables(rectified.right)
+    return PairView(camera, rectified.cam_T_rect[:3, :3], rig.baseline, nearest, left, right)
 
 
-def motion_view(first: Camera, second: Camera, first_T_second: F64, focal: float) -> PairView | None:
-    """The view of two images taken from different places: all around the line between them.
+def motion_view(first: Rig, second: Rig, first_T_second: F64, focal: float) -> PairView | None:
+    """The view of two left images taken from different places: all around the line between them.
 
     Args:
-        first, second: their cameras. first_T_second: (4, 4) metres. focal: resolution, px per radian.
+        first, second: their rigs. first_T_second: (4, 4) metres, of the left cameras. focal: resolution, px per radian.
 
     Returns:
         None where both see too little in common.
@@ -132,13 +132,13 @@ def motion_view(first: Camera, second: Camera, first_T_second: F64, focal: float
     camera = Epipolar(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1))
     sources = (first, view_R_first), (second, view_R_first @ first_T_second[:3, :3])
     some = camera.bearing_grid(COARSE_PX)
-    masks = [source.inside(source.project(some @ rotation)) for source, rotation in sources]
+    masks = [rig.left.inside(rig.left.project(some @ rotation)) for rig, rotation in sources]
     v = _span(np.flatnonzero((masks[0] & masks[1]).any(axis=1)), height)
     u = _span(np.flatnonzero((masks[0] | masks[1]).any(axis=0)), width)
     cropped = Epipolar(u.stop - u.start, v.stop - v.start, focal, focal, camera.cx - u.start, camera.cy - v.start)
     if min(cropped.size) < 16:
         return None
-    parts = [_resampling(source, cropped, rotation) for source, rotation in sources]
+    parts = [_resampling(rig.left, rig.left_mask, cropped, rotation) for rig, rotation in sources]
     return PairView(cropped, view_R_first.T, baseline, NEAREST_M, parts[0], parts[1])
 
 
@@ -164,10 +164,10 @@ def _is_narrow(camera: Camera) -> bool:
     return bool(np.isfinite(ends).all() and ends[0] @ ends[1] > np.cos(np.deg2rad(WIDE_DEG)))
 
 
-def _resampling(source: Camera, target: Camera, target_R_source: F64) -> _Resampling:
-    return _Resampling(*remap_tables(source, target, target_R_source))
+def _resampling(source: Camera, used: Bool | None, target: Camera, target_R_source: F64) -> _Resampling:
+    """`used`: (H, W) of the source; what it does not cover has none."""
+    return _tables(camera_rectification(source, used, target, target_R_source))
 
 
-def _both(rectified: Rectification) -> tuple[_Resampling, _Resampling]:
-    left, right = rectified.left, rectified.right
-    return _Resampling(left.table, left.fraction, left.mask), _Resampling(right.table, right.fraction, right.mask)
+def _tables(found: CameraRectification) -> _Resampling:
+    return _Resampling(found.table, found.fraction, found.mask)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -58,13 +60,28 @@ def test_a_pair_finds_walls_ahead_and_beside(rig: Rig) -> None:
     assert np.median(error[known]) < 0.01
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_what_a_mask_covers_has_no_depth(scale: float) -> None:
+    """The robot's own tray, at any resolution of the view, by a pair and by motion."""
+    used = np.ones((480, 640), bool)
+    used[360:] = False
+    rig = replace(pinhole_rig(), left_mask=used)
+    ahead = se3.exp(np.array([0.01, 0.0, 0.25, 0.0, 0.02, 0.0]))
+    for view in (stereo_view(rig, scale), motion_view(rig, rig, ahead, scale * rig.left.fx)):
+        assert view is not None
+        uv = rig.left.project(view.camera.bearing_grid() @ view.cam_R_view.T)
+        inside = rig.left.inside(uv)
+        assert not view.first.mask[inside & (uv[..., 1] > 362)].any()
+        assert view.first.mask[inside & (uv[..., 1] < 358)].mean() > 0.9
+
+
 def test_two_keyframes_straight_ahead_are_a_pair() -> None:
     """The epipole is in the middle of the image: no pinhole rectification exists."""
     rig = fisheye_rig()
     planes = [(0, -1.2), (0, 1.3), (2, 4.0)]
     ahead = se3.exp(np.array([0.01, 0.0, 0.25, 0.0, 0.02, 0.0]))
     images = [render(rig.left, pose, planes)[0] for pose in (np.eye(4), ahead)]
-    view = motion_view(rig.left, rig.left, ahead, 0.5 * rig.left.fx)
+    view = motion_view(rig, rig, ahead, 0.5 * rig.left.fx)
     assert view is not None
     depth = pair_depth(view, *images)
     truth = truth_of(view, np.eye(4), planes)
