@@ -14,7 +14,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import Source, Stamps, chosen_frames
 from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import StartCheck, StereoImage
+from stereo_sfm.types import CalibrationUpdate, StartCheck, StereoImage
 
 if TYPE_CHECKING:
     from stereo_sfm.calib.start import StartFinding
@@ -164,6 +164,19 @@ class _FirstImages:
         if self._failure is not None:
             raise self._failure
         yield from self._images
+
+
+def corrected_since(check: StartCheck, start: Rig, correction: CalibrationUpdate) -> StartCheck:
+    """What the start of the next run of the same images is known to need, where the run's correction is kept.
+
+    Args:
+        check: of the run's first images. start: the rig that it began with. correction: of that rig.
+    """
+    from stereo_sfm.calib.choice import with_terms
+
+    if not (check.rig and correction.applied):
+        return check
+    return replace(check, rig=_as_text(with_terms(start, correction.terms)))
 
 
 def _as_text(rig: Rig) -> str:

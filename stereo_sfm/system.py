@@ -26,6 +26,7 @@ from stereo_sfm.maps.folders import MapFolders, saved_map_of
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.single_image import still_keyframe
+from stereo_sfm.maps.store import lock_versioned
 from stereo_sfm.messages import Sink
 from stereo_sfm.pipeline.image_input import ImageInput
 from stereo_sfm.pipeline.inline import InlineRun
@@ -240,8 +241,13 @@ class System:
         return saved
 
     def save_map(self, folder: str | Path) -> None:
-        """Write the map folder that `load_map` and `--map-in` read."""
-        save_map(self.saved_map(), Path(folder).expanduser())
+        """Write the map folder that `load_map` and `--map-in` read.
+
+        Raises:
+            StereoSfmError: nothing is mapped, or a service extends the map of that folder.
+        """
+        with lock_versioned(Path(folder).expanduser()):
+            save_map(self.saved_map(), Path(folder).expanduser())
 
 
 class MapLocator:

@@ -12,7 +12,9 @@ import pytest
 
 import stereo_sfm as s
 from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.saved_map import save_map
+from stereo_sfm.maps.store import lock
 from stereo_sfm.pipeline.image_input import ImageInput
 from tests.synthetic import pinhole_rig
 
@@ -99,6 +101,8 @@ def test_a_map_is_saved_loaded_and_queried(recording: tuple[s.Rig, list[s.Stereo
     rig, images = recording
     with s.System(rig) as system:
         assert list(system.run(images))[-1] is system.frame
+    with lock(tmp_path / "store"), pytest.raises(StereoSfmError, match="stop the service that extends it"):
+        system.save_map(tmp_path / "store")
     system.save_map(str(tmp_path / "store"))
     locator = s.MapLocator(s.load_map(str(tmp_path / "store")))
     answer = locator.locate(images[6].left, images[6].right)

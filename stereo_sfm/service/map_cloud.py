@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -44,15 +45,21 @@ class MapCloudBuilder:
         self._thread.join()
 
     def _work(self) -> None:
-        next_s, stamp_ns = 0.0, 0
-        while (message := self._queue.get()) is not None and not self._closing:
-            if isinstance(message, Keyframe):
-                stamp_ns = message.stamp_ns
-                continue
-            self.apply(message)
-            if time.monotonic() >= next_s and self._queue.empty():
+        next_s, stamp_ns, unsent = 0.0, 0, -1  # version that was not sent yet
+        while not self._closing:
+            with contextlib.suppress(queue.Empty):
+                message = self._queue.get(timeout=None if unsent < 0 else max(next_s - time.monotonic(), 0.0))
+                if message is None:
+                    return
+                if isinstance(message, Keyframe):
+                    stamp_ns = message.stamp_ns
+                else:
+                    self.apply(message)
+                    unsent = message.version
+            if unsent >= 0 and time.monotonic() >= next_s and self._queue.empty() and not self._closing:
                 next_s = time.monotonic() + EVERY_S
-                self._send(self.cloud(stamp_ns, message.version))
+                self._send(self.cloud(stamp_ns, unsent))
+                unsent = -1
 
     def apply(self, update: MapUpdate) -> None:
         """Follow one update."""

@@ -178,6 +178,8 @@ class Pipelines:
             self.session, self.map_complete = None, session.map_complete
             if isinstance(self._opener, SourceChoice):
                 self._opener = same_camera(self._opener, session.serial)
+                if self._opener.start_check is not None and session.start_check is not None:
+                    self._opener = with_known_start(self._opener, session.start_check)  # as corrected since
 
     def _not_started(self, error: StereoSfmError) -> None:
         """Something else than the camera is the reason."""

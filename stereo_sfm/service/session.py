@@ -11,6 +11,7 @@ from typing import Any
 from stereo_sfm.calib.camera_store import CorrectionKeeper
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
+from stereo_sfm.drivers.start_checked import corrected_since
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.capture import SourceInfo
@@ -207,6 +208,8 @@ class Session:
         if update.calibration is not None:
             assert self._corrections is not None
             self._corrections.keep(update.calibration)
+            if self._opener.camera_store is not None and self.start_check is not None:
+                self.start_check = corrected_since(self.start_check, self._run.info.rig, update.calibration)
 
     def _localize(self, message: Localized) -> None:
         assert self._poses is not None

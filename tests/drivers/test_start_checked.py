@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.drivers.choice import MadeSource, SourceChoice, with_known_start, with_start_check
 from stereo_sfm.drivers.memory import MemorySource
-from stereo_sfm.drivers.start_checked import RigChanged, StartCheckedSource
+from stereo_sfm.drivers.start_checked import RigChanged, StartCheckedSource, corrected_since
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.types import CalibrationUpdate
 
 SPEC = "sim:aisle?camera=pinhole&size=320x200&rate=10&frames=16&effects=false"
 
@@ -51,6 +53,23 @@ def test_a_wrong_calibration_is_corrected_and_no_image_is_lost(good: tuple[s.Rig
     with StartCheckedSource(MemorySource(turned(rig), images), correct=True, known=known) as again:
         assert np.array_equal(again.rig.left_T_right, found.left_T_right)
         assert ids(again) == list(range(len(images)))
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_a_correction_of_the_run_is_known_at_the_next_start(
+    good: tuple[s.Rig, list[s.StereoImage]], applied: bool
+) -> None:
+    """The service begins again after a stage has died: with what the camera store keeps meanwhile, if it is kept."""
+    rig, images = good
+    with StartCheckedSource(MemorySource(turned(rig), images), correct=True) as source:
+        start, known = source.rig, source.start_check
+    assert known is not None
+    terms = np.deg2rad([0.1, -0.2, 0.05, 0, 0, 0, 0, 0])
+    correction = CalibrationUpdate(7, 3, 0, terms, np.eye(8), 0, applied, "significant", "")
+    known = corrected_since(known, start, correction)
+    with StartCheckedSource(MemorySource(turned(rig), images), correct=True, known=known) as again:
+        expected = with_terms(start, terms) if applied else start
+        np.testing.assert_allclose(again.rig.left_T_right, expected.left_T_right, atol=1e-12)
 
 
 def test_it_is_only_reported_where_nothing_is_to_be_corrected(good: tuple[s.Rig, list[s.StereoImage]]) -> None:

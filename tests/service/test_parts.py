@@ -25,7 +25,7 @@ from stereo_sfm.messages import Compiling, Localized
 from stereo_sfm.pipeline.channels import Failed
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import _error  # pyright: ignore[reportPrivateUsage]
-from stereo_sfm.service import pipelines
+from stereo_sfm.service import map_cloud, pipelines
 from stereo_sfm.service import recorder as service_recorder
 from stereo_sfm.service.camera import patient, same_camera
 from stereo_sfm.service.commands import Commands
@@ -267,6 +267,25 @@ def test_the_cloud_forgets_what_the_mapper_removed() -> None:
     cloud = follower.cloud(5, 199)
     assert len(cloud.point_ids) == 100 and cloud.point_ids.min() == 1900 and (np.diff(cloud.point_ids) > 0).all()
     assert cloud.points[-1, 0] == 199.0 and not cloud.saved
+
+
+def test_the_last_update_is_sent_where_no_other_follows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A robot that parks after a loop: its map is the corrected one."""
+    monkeypatch.setattr(map_cloud, "EVERY_S", 0.3)
+    clouds = list[MapCloud]()
+    follower = MapCloudBuilder(1, clouds.append)
+    for version in (1, 2):
+        follower.put(update(version, np.eye(4), [version]))
+        for _ in range(200):
+            if clouds:
+                break
+            time.sleep(0.02)
+    for _ in range(200):
+        if len(clouds) > 1:
+            break
+        time.sleep(0.02)
+    follower.close()
+    assert [cloud.version for cloud in clouds] == [1, 2]
 
 
 def test_a_late_callback_gets_the_newest_state_first_and_a_failing_one_affects_no_other() -> None:
