@@ -84,6 +84,7 @@ class Result:
     scale: float  # of the map
     sigma_deg: F64  # (3,) stated, of the rotation; zero without a correction
     mended: Rig  # at the end
+    lost: int  # frames without a pose
 
 
 class Store:
@@ -135,7 +136,8 @@ def measure(images: list[StereoImage], believed: Rig, true: Rig, truth: Trajecto
     found = evaluate(mapped, truth)
     covariance = record.calibrations[-1].terms_covariance if record.calibrations else np.zeros((RIG_TERMS, RIG_TERMS))
     sigma = np.rad2deg(np.sqrt(np.diag(covariance)[:3]))
-    return Result(left, found.ape_m.rmse, len(record.calibrations), noticed, found.sim3_scale, sigma, mended)
+    lost = int((~record.tracked()).sum())
+    return Result(left, found.ape_m.rmse, len(record.calibrations), noticed, found.sim3_scale, sigma, mended, lost)
 
 
 def row(name: str, result: Result, base: float) -> None:
@@ -157,7 +159,8 @@ def static(name: str, store: Store, every: int, bad: list[str]) -> Result:
     for degrees in TURNS[::every]:
         result = measure(images, turned(rig, degrees), rig, truth)
         row(f"turned {degrees}", result, true.ate_m)
-        if (np.abs(result.left_deg) > LEFT_DEG).any() or result.ate_m > ATE * true.ate_m:
+        wrong = (np.abs(result.left_deg) > LEFT_DEG).any() or result.ate_m > ATE * true.ate_m
+        if wrong or result.lost > true.lost:
             bad.append(f"{name}: turned {degrees}")
     return true
 
@@ -171,7 +174,7 @@ def moving(name: str, store: Store, how: str, base: float, bad: list[str]) -> No
     row(f"{how}, uncorrected", off, base)
     begin = 0.5 * len(images) / RATE_HZ if how == "step" else 0.0
     late = how == "step" and not begin <= result.noticed_s <= begin + NOTICED_S
-    if late or result.ate_m > ATE_STEP * base:
+    if late or result.ate_m > ATE_STEP * base or result.lost > off.lost:
         bad.append(f"{name}: {how}")
 
 
@@ -191,6 +194,8 @@ def residual(name: str, store: Store, bad: list[str]) -> None:
         limit = np.minimum(STATED * on.sigma_deg, RESIDUAL_DEG) if on.changes else RESIDUAL_DEG
         if (np.abs(on.left_deg) > limit).any():
             bad.append(f"{name}: residual, turned {degrees}: rotation")
+        if on.lost > off.lost:
+            bad.append(f"{name}: residual, turned {degrees}: lost")
         if lengths[0] > lengths[1] + LENGTHS_DIFFER:
             bad.append(f"{name}: residual, turned {degrees}: lengths")
         if rows[0] > rows[1] + ROWS_DIFFER_PX:

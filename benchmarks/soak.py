@@ -228,9 +228,8 @@ def cause(service: Service, watch: Watch, fault: str) -> float:
         service.set_setting("recording.min_free_gb", "0.05")
         wait_for(lambda: watch.states[-1][1] != "disk_full")
         return time.monotonic() - began
-    pid = service.pids.get(what)
-    if pid is None:
-        return 0.0
+    wait_for(lambda: service.pids.get(what) is not None)
+    pid = service.pids[what]
     os.kill(pid, signal.SIGKILL if kind == "kill" else signal.SIGSTOP)
     if what in ("recorder", "loop"):  # which cost no session
         wait_for(lambda: service.pids.get(what) not in (None, pid))
@@ -336,9 +335,9 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
                     wrong.append(f"frame {frame}, {fault}: {took[-1][2]:.1f} s until the next pose")
             except TimeoutError as error:
                 wrong.append(f"frame {frame}, {fault}: {error}")
-        while not service.wait(1.0):
-            if o.most is not None and time.monotonic() - began > 60 * o.most:
-                break
+        cut = False
+        while not (cut or service.wait(1.0)):
+            cut = o.most is not None and time.monotonic() - began > 60 * o.most
         if turns is not None:
             turns.end()
         stop_s = time.monotonic()
@@ -346,6 +345,10 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
           f"in {(time.monotonic() - began) / 60:.1f} min")  # fmt: skip
     print(f"poses {watch.poses}, without a pose {watch.untracked}, sessions {len(watch.sessions)}; "
           f"ended in {time.monotonic() - stop_s:.1f} s")  # fmt: skip
+    if service.error is not None:
+        wrong.append(f"the service ended by itself: {service.error}")
+    elif not cut and watch.frame < count - RATE:
+        wrong.append(f"it ended at frame {watch.frame} of {count}")
     socket_seen = receive.recv() if receive.poll(10.0) else None
     wrong += judge_memory(watch) + judge_poses(watch, dark, socket_seen) + judge_faults(watch, o.times)
     wrong += turns.judge() if turns is not None else []
