@@ -59,8 +59,7 @@ def _drawn(folder: Path) -> tuple[F64, float] | None:
         raise StereoSfmError(f"{folder / ABOUT} does not say where the drawing lies: remove {DRAWING} too") from None
     blue, green, red = (drawn[..., k].astype(int) for k in range(3))
     rows, columns = np.nonzero((red - np.maximum(blue, green) > STANDS_OUT)[::-1])  # the first row has the least y
-    low: F64 = origin + np.column_stack([columns, rows]) * resolution
-    return low, resolution
+    return np.asarray(origin + np.column_stack([columns, rows]) * resolution, float), resolution
 
 
 def write_zones(folder: Path, plan: FloorPlan, zones: Bool, base_T_left: F64) -> None:
