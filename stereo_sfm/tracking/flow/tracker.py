@@ -375,12 +375,12 @@ class Tracker:
 
         `jumped`: the motion since the last image, in `seconds`, is not that of the camera.
         """
-        if seconds > 0 and not jumped:
+        if jumped:
+            self._velocity = self._recovery.motion.velocity()
+        elif seconds > 0:
             mean = se3.log(se3.inverse(self._pose) @ solution.pose) / seconds
             self._shutter.learn(mean, seconds)
             self._velocity = solution.velocity if self._shutter.active else mean
-        if jumped:
-            self._velocity = self._recovery.motion.velocity()
         inlier = solution.inlier & ~tracks.moving
         self._loss.followed()
         tracks.age = tracks.age + np.int32(1)
