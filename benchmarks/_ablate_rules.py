@@ -158,7 +158,7 @@ RULES = (
     _rule(
         "velocity after recovery",
         TRACKER,
-        "if jumped:\n            self._velocity",
+        "if recovered or not timed:\n            self._velocity",
         "if False:\n            self._velocity",
     ),
     _rule("robot at rest", "tracking/inertial/rest.py", "if not still or not sensors_still():", "if True:"),

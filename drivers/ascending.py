@@ -113,7 +113,9 @@ class AscendingSource(WrappedSource):
         for k, stamp_ns in enumerate(truth.stamp_ns.tolist()):
             waiting.append(k)
             if good := clock.step(stamp_ns):
-                rows, stamps, waiting = rows + waiting[-len(good) :], stamps + good, []
+                rows.extend(waiting[-len(good) :])
+                stamps.extend(good)
+                waiting = []
         return Trajectory(np.array(stamps, np.int64), truth.poses[rows], truth.oriented)
 
     def stamps(self) -> Stamps | None:

@@ -84,7 +84,8 @@ def parts_of(reference: Trajectory, stamp_ns: I64) -> I64:
     steps = np.diff(reference.stamp_ns)
     if not len(steps):
         return np.zeros(len(stamp_ns), np.int64)
-    holes = reference.stamp_ns[1:][steps > max(MIN_HOLE_NS, HOLE_STEPS * float(np.median(steps)))]
+    middles = reference.stamp_ns[:-1] + steps // 2
+    holes = middles[steps > max(MIN_HOLE_NS, HOLE_STEPS * float(np.median(steps)))]
     return np.searchsorted(holes, stamp_ns, side="right")
 
 

@@ -68,16 +68,22 @@ def apply_loop(
         return Correction(False, [])
     before = map_.keyframe_poses()
     odometry, closed = odometry_edges(map_, before), loop_edges(map_, [*earlier, loop])
-    if bridges is not None:
-        weak = edges_of_poses(before, *bridges, 0.0, 0.0)
-        odometry = join([odometry, dataclasses.replace(weak, sigmas=np.tile(BRIDGE, (len(weak), 1)))])
     bent = _strain(before, closed) > MAX_NOISE
-    part = _components(len(before), join([odometry, Edges(*(column[:-1] for column in vars(closed).values()))]))
+    measured = join([odometry, Edges(*(column[:-1] for column in vars(closed).values()))])
+    part = _components(len(before), measured)
     apart, start = part[a] != part[b], before
     if apart:  # a submap that this loop connects with the rest: move the newer part there as a rigid body first
         move = before[a] @ loop.candidate_T_kf @ se3.inverse(before[b])
-        newer, move = (b, move) if part[b] > part[a] else (a, se3.inverse(move))
-        start = np.where((part == part[newer])[:, None, None], move @ before, before)
+        newer, older, move = (b, a, move) if part[b] > part[a] else (a, b, se3.inverse(move))
+        moving = part
+        if bridges is not None:  # and with it what hangs on it alone
+            free = (part[bridges[0]] != part[older]) & (part[bridges[1]] != part[older])
+            weak = edges_of_poses(before, bridges[0][free], bridges[1][free], 0.0, 0.0)
+            moving = _components(len(before), join([measured, weak]))
+        start = np.where((moving == moving[newer])[:, None, None], move @ before, before)
+    if bridges is not None:  # as they lie now: nothing measured them
+        weak = edges_of_poses(start, *bridges, 0.0, 0.0)
+        odometry = join([odometry, dataclasses.replace(weak, sigmas=np.tile(BRIDGE, (len(weak), 1)))])
     if config.correction == "averaging":
         after = start if apart else _averaged(map_, before, loop, a, b)
     elif config.correction == "pose_graph":

@@ -204,9 +204,9 @@ class Mapper(AnyMapper):
 
     def _update(self, kf_id: int) -> MapUpdate:
         (kf, gone, pt), table = self.map.take_delta(), self.map.keyframes
-        felt = table.alive & (table.down_sigma > 0)
-        first = felt & (table.submap_id == table.submap_id[0])  # whose frame is the map's
-        level = np.flatnonzero(first if first.any() else felt)
+        felt = np.flatnonzero(table.alive & (table.down_sigma > 0))
+        level = felt[table.submap_id[felt] == table.submap_id[0]]  # whose frame is the map's
+        level = level if len(level) else felt[table.submap_id[felt] == table.submap_id[felt[-1:]]]
         culled = self.map.points.pt_id[np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))]
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
         refused = np.array(self._refused, np.int64)

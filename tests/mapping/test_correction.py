@@ -216,27 +216,35 @@ def test_same_map_same_bits(sequence: StoreSequence) -> None:
     assert bits() == bits()
 
 
+@pytest.mark.parametrize("off", [None, [5.0, 0.0, 0.0, 0.0, 1.5, 0.0]])
 @pytest.mark.parametrize("bridged", [True, False])
-def test_a_session_moves_as_a_whole_though_tracking_was_lost_in_it(sequence: StoreSequence, bridged: bool) -> None:
-    """A saved map, and a session of two submaps, of which one shows a place of the map; the other goes with it."""
+def test_a_session_moves_as_a_whole_though_tracking_was_lost_in_it(
+    sequence: StoreSequence, bridged: bool, off: list[float] | None
+) -> None:
+    """A saved map, and a session of two submaps, of which one shows a place of the map; the other goes with it.
+
+    The second lies to the first as predicted, which may be far `off`: its own loop then puts it right.
+    """
     a, b = ends(sequence)
     begin = len(sequence.keyframes) // 2
     cut = (begin + b) // 2
-    astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
+    astray, turned = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0])), se3.exp(np.array(off or [0.0] * 6))
     pieces = list[Keyframe]()
     physical = dict(sequence.physical)
     for k, keyframe in enumerate(sequence.keyframes):
         submap = int(k >= begin) + int(k >= cut)
         ids = keyframe.point_ids + submap * 10**6
         physical.update(zip(ids.tolist(), (sequence.physical[i] for i in keyframe.point_ids.tolist()), strict=True))
-        pose = astray @ keyframe.odom_T_cam if submap else keyframe.odom_T_cam
+        pose = [np.eye(4), astray, astray @ turned][submap] @ keyframe.odom_T_cam
         pieces.append(dataclasses.replace(keyframe, submap_id=submap, odom_T_cam=pose, point_ids=ids))
     lost = dataclasses.replace(sequence, keyframes=pieces, physical=physical)
     map_ = raw_map(lost)
-    bridges = np.array([cut - 1]), np.array([cut])
-    done = apply_loop(map_, true_loop(lost, a, b), [], LoopConfig(), bridges=bridges if bridged else None)
-    assert done.applied
-    assert (trajectory_error(map_, sequence.world_T_kf) < 0.3) == bridged
+    bridges = (np.array([cut - 1]), np.array([cut])) if bridged else None
+    first, second = true_loop(lost, a, b), true_loop(lost, 2, cut - 2)
+    assert apply_loop(map_, first, [], LoopConfig(), bridges=bridges).applied
+    assert (trajectory_error(map_, sequence.world_T_kf) < 0.3) == (bridged and off is None)
+    assert apply_loop(map_, second, [first], LoopConfig(), bridges=bridges).applied
+    assert trajectory_error(map_, sequence.world_T_kf) < 0.3
 
 
 def test_a_loop_between_sessions_that_loops_alone_join_is_allowed_to_drift() -> None:

@@ -21,6 +21,7 @@ from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.flow.keyframes import Keyframes
+from stereo_sfm.tracking.inertial.agreement import SensorUse
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.inertial.series import LONGEST_S, SampleBuffer, Series
@@ -369,3 +370,18 @@ def test_a_gyroscope_agrees_with_the_images_of_a_fast_camera() -> None:
         noise = np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 3e-4, 3)])
         motion.accept(stamp, session.pose(stamp * 1e-9) @ se3.exp(noise))
         assert not motion.left_out
+
+
+def test_an_image_of_a_wrong_stamp_does_not_contradict_the_gyroscope() -> None:
+    session, rng = Session(seconds=8.0), np.random.default_rng(0)
+    samples, motion, at = session.samples(0), InertialMotion(session.imu), 0
+    for k in range(int(session.seconds * 1e9) // FRAME_NS):
+        true = k * FRAME_NS
+        stamp = true + (FRAME_NS - 1_000_000) * (k == 80)  # a millisecond before the next
+        until = int(np.searchsorted(samples.stamp_ns, stamp, side="right"))
+        motion.feed(samples.part(slice(at, until)))
+        at = until
+        noise = np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 1.5e-4, 3)])
+        motion.accept(stamp, session.pose(true * 1e-9) @ se3.exp(noise), timed=k != 81)
+        assert not motion.left_out
+    assert motion.use == SensorUse.USED

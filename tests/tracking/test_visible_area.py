@@ -61,6 +61,16 @@ def test_a_dark_image_says_nothing_of_the_rim(first: str) -> None:
     assert not area.mask[angles(camera) > 70.5].any()
 
 
+def test_a_bright_centre_does_not_make_the_rim_narrower() -> None:
+    """A dim aisle, then a door to the daylight in its middle."""
+    camera = fisheye_rig().left
+    area = VisibleArea(camera, 88.0)
+    area.learn(half_image(camera, 85, 60))
+    before = area.mask
+    area.learn(np.where(angles(camera) < 65, 250, 20).astype(np.uint8))
+    assert (area.mask == before).all()
+
+
 def test_narrow_lenses_have_no_rim() -> None:
     camera = Pinhole(640, 480, 400, 400, 320, 240)
     area = VisibleArea(camera, 88.0)

@@ -24,7 +24,7 @@ from stereo_sfm.types import F64, U8
 log = logging.getLogger("stereo_sfm")
 
 LONGEST_S = 120.0
-AGAIN_S = 60.0  # after an attempt that failed: the machine was busy, or the map is still too small
+AGAIN_S = 60.0  # after an attempt that failed, as the machine was busy; then twice as long each time
 RawPlan = tuple[U8, float, tuple[float, float], F64]  # the arguments of `aligned`, in the left camera's axes
 CELLS: dict[int, int] = {FREE: 0, OCCUPIED: 100, UNKNOWN: -1}  # of nav_msgs/OccupancyGrid
 
@@ -59,15 +59,17 @@ class FloorGrids:
         self._take = take
         self._made_of = ("", 0)  # folder and time of the save
         self._begun_s, self._problem = 0.0, ""  # the newest attempt, and why it failed
+        self._again_s = AGAIN_S
         self._thread: threading.Thread | None = None
 
     def follow(self, status: Status) -> None:
         """Make the plan if the map has been saved since, and none is being made."""
         busy = self._thread is not None and self._thread.is_alive()
         saved = status.map_folder, status.map_saved_ns
-        again = self._problem and time.monotonic() > self._begun_s + AGAIN_S
+        again = self._problem and time.monotonic() > self._begun_s + self._again_s
         if busy or not all(saved) or (saved == self._made_of and not again):
             return
+        self._again_s = 2 * self._again_s if again else AGAIN_S
         self._made_of, self._begun_s = saved, time.monotonic()
         self._thread = threading.Thread(target=self._make, args=(status.map_folder,), daemon=True)
         self._thread.start()

@@ -60,10 +60,12 @@ class MotionPrior:
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, F64]] = deque()
+        self._trusted_ns = 0  # the newest pose that most points agree with
 
-    def add(self, stamp_ns: int, odom_T_cam: F64) -> None:
-        """Add the pose of a frame that most points agree with."""
+    def add(self, stamp_ns: int, odom_T_cam: F64, trusted: bool = True) -> None:
+        """Add the pose of a frame. `trusted`: most points agree with it."""
         self._poses.append((stamp_ns, odom_T_cam))
+        self._trusted_ns = stamp_ns if trusted else self._trusted_ns
         while stamp_ns - self._poses[1 if len(self._poses) > 1 else 0][0] > WINDOW_S * 1e9:
             self._poses.popleft()
 
@@ -89,12 +91,14 @@ class MotionPrior:
     def expect(self, stamp_ns: int) -> Expectation:
         """The predicted pose at a time, with the last speed and turn rate decreasing exponentially."""
         (last_ns, last), periods = self._poses[-1], self._seconds(stamp_ns) / RETURN_S
+        mean = last @ se3.exp(self.velocity() * np.repeat(RETURN_S * -np.expm1(-periods), 3))
+        periods = max((stamp_ns - self._trusted_ns) * 1e-9, 0.0) / RETURN_S
         gone = -np.expm1(-periods)  # share of a speed that is gone
         known = 0.0 if self._poses[0][0] == last_ns else gone**2  # by the velocity, once there is motion
-        velocity = self.velocity()
-        spread = np.maximum(SPREAD, np.linalg.norm(velocity.reshape(2, 3), axis=1))  # who is faster is no such robot
+        speeds = np.linalg.norm(self.velocity().reshape(2, 3), axis=1)
+        spread = np.maximum(SPREAD, speeds)  # who is faster is no such robot
         sigmas = spread * RETURN_S * np.sqrt(np.maximum(2 * (periods - gone) - known, 0.0))
-        return Expectation.around(last @ se3.exp(velocity * np.repeat(RETURN_S * gone, 3)), sigmas)
+        return Expectation.around(mean, sigmas)
 
     def steady(self, stamp_ns: int) -> Expectation:
         """The pose at a time if the robot goes on straight at its speed, which most do most of the time."""

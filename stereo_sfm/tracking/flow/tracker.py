@@ -54,7 +54,7 @@ TRUSTED_LEFT = 0.5  # of the newest keyframe's points, with which a pose may be 
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on
 REFERENCE_NS = 200_000_000  # from one image that may become the reference to the next
-SHORT = 0.5  # of the usual interval between images: a shorter one is an error of the clock
+SHORT = 0.4  # of the usual interval between images, of which each second one may be missing: shorter is a clock's error
 USUAL = 15  # intervals whose median is the usual one
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
@@ -177,11 +177,11 @@ class Tracker:
         self._refine(tracks, solution, expected, recovered or not timed)
         trusted = self._trusted(tracks, solution)
         if trusted or self._recovery.motion.stale(image.stamp_ns):
-            self._recovery.motion.add(image.stamp_ns, solution.pose)
+            self._recovery.motion.add(image.stamp_ns, solution.pose, trusted)
         if trusted:
             self._renew_reference(image, images, tracks, solution)
         stats = _stats(tracks, solution)
-        inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered or not timed)
+        inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered, timed)
         if self._readout is not None:
             self._readout.add(image.stamp_ns, self._pose, self._tracks, inlier)
             self._use_readout(self._readout)
@@ -369,13 +369,14 @@ class Tracker:
         tracks: Tracks,
         solution: PoseSolution,
         seconds: float,
-        jumped: bool,
+        recovered: bool,
+        timed: bool,
     ) -> Bool:
         """Update the state with the image's pose; returns which of the remaining points (N,) are inliers.
 
-        `jumped`: the motion since the last image, in `seconds`, is not that of the camera.
+        `recovered`: the pose was searched for. `timed`: the motion since the last image took `seconds`.
         """
-        if jumped:
+        if recovered or not timed:
             self._velocity = self._recovery.motion.velocity()
         elif seconds > 0:
             mean = se3.log(se3.inverse(self._pose) @ solution.pose) / seconds
@@ -389,8 +390,8 @@ class Tracker:
         self._movers.update(self._tracks, tracks, self._rig.left, solution.pose)
         self._continue(image, images, solution.pose, tracks)
         if self._sensors is not None:
-            self._sensors.accept(image.stamp_ns, solution.pose)
-        self._keyframes.count_frame(seconds if jumped or 2 * np.count_nonzero(inlier) < len(inlier) else 0.0)
+            self._sensors.accept(image.stamp_ns, solution.pose, timed)
+        self._keyframes.count_frame(seconds if recovered or 2 * np.count_nonzero(inlier) < len(inlier) else 0.0)
         return inlier[kept]
 
     def _timed(self, seconds: float) -> bool:

@@ -24,6 +24,7 @@ CENTRE_DEG = 45.0  # angle from the axis within which the brightness is that of 
 MIN_RIM_DEG = 60.0  # smaller angles are dark surroundings, not the rim
 LIT = 0.3  # of the median brightness in the centre, above which a pixel is bright
 LIT_SHARE = 0.1  # of bright pixels at one angle, at which it is inside the image circle
+LEAST = 16  # median brightness in the centre of an image that shows the rim: four times the noise of black
 WINDOW = 7  # px of the half image: margin to the rim for the windows of points
 GRID = 8, 6  # columns and rows of cells, over which points should be spread
 
@@ -44,8 +45,9 @@ class VisibleArea:
             angle = np.nan_to_num(np.degrees(np.arccos(np.clip(grid[..., 2], -1, 1))), nan=180.0)
         self._camera = camera
         self._degree = angle.astype(np.int64)  # (H / 4, W / 4)
-        self._centre = 0  # median brightness in the centre, of the brightest image so far
-        self._lit: I64 = np.zeros(181, np.int64)  # brightness that LIT_SHARE of pixels at each degree reached
+        self._lit = np.zeros(
+            181
+        )  # brightness that LIT_SHARE of pixels at each degree reached, over the centre's median
         self._rim_deg = 181
         self._allowed = corner_mask(camera, max_angle_deg)
         self._used = np.ones_like(self._allowed) if mask is None else uncovered(half_size(mask), WINDOW // 2)
@@ -61,8 +63,10 @@ class VisibleArea:
         if self._degree[0, 0] < MIN_RIM_DEG:
             return
         centre, lit = _brightness(half_image[::STEP, ::STEP], self._degree)
-        self._centre, self._lit = max(self._centre, centre), np.maximum(self._lit, lit)
-        rim = int(np.flatnonzero(self._lit > LIT * self._centre).max(initial=0)) + 1
+        if centre < LEAST:  # its noise is as bright beyond the rim
+            return
+        self._lit = np.maximum(self._lit, lit / centre)
+        rim = int(np.flatnonzero(self._lit > LIT).max(initial=0)) + 1
         if rim >= MIN_RIM_DEG and rim != self._rim_deg:
             self._rim_deg = rim
             shown = self._camera.valid_mask(math.radians(rim), step=2).astype(np.uint8)

@@ -148,13 +148,16 @@ class InertialMotion:
         noise = cam_R_imu @ motion.covariance[:3, :3] @ cam_R_imu.T + common * np.eye(3)
         return self._rotation.fused(predicted, turn, noise, seen, covariance)
 
-    def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
-        """The images gave this pose (4, 4)."""
+    def accept(self, stamp_ns: int, odom_T_cam: F64, timed: bool = True) -> None:
+        """The images gave this pose (4, 4). `timed`: the time since the last one is right."""
         odom_T_imu = odom_T_cam @ self._imu.left_T_imu
         if not self._begun:
             self.begin(stamp_ns, odom_T_cam)
             return
-        self._compare(stamp_ns, odom_T_imu)
+        if timed:
+            self._compare(stamp_ns, odom_T_imu)
+        else:
+            self._rates.begin()
         self._last_ns, self._odom_T_last = stamp_ns, odom_T_imu
         if stamp_ns - self._node_ns < NODE_NS:
             return
@@ -267,7 +270,7 @@ class InertialMotion:
             return
         seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]
         off = se3.so3_log(motion.rotation.T @ seen)
-        beyond = max(float(off @ off) - 6 * ROTATION_SIGMA**2, 0.0)  # the noise of two poses
+        beyond = float(off @ off) - 6 * ROTATION_SIGMA**2  # the noise of two poses
         self._turn_errors = [*self._turn_errors[1 - JUDGED :], beyond / motion.seconds**2]
         t = motion.seconds
         self._rates.add(se3.so3_log(motion.rotation) / t + motion.gyro_bias, se3.so3_log(seen) / t, t)

@@ -121,15 +121,16 @@ class MotionSensors:
             if sensor is not None:
                 sensor.begin(stamp_ns, odom_T_cam)
 
-    def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
-        """The images gave this pose (4, 4)."""
+    def accept(self, stamp_ns: int, odom_T_cam: F64, timed: bool = True) -> None:
+        """The images gave this pose (4, 4). `timed`: the time since the last one is right."""
         self._last_ns, self._reckoning = stamp_ns, None
         inertial, wheels = self._renewed
         self._inertial, self._wheels = inertial or self._inertial, wheels or self._wheels
         self._renewed = None, None
-        for sensor in (self._inertial, self._wheels):
-            if sensor is not None:
-                sensor.accept(stamp_ns, odom_T_cam)
+        if self._inertial is not None:
+            self._inertial.accept(stamp_ns, odom_T_cam, timed)
+        if self._wheels is not None:
+            self._wheels.accept(stamp_ns, odom_T_cam)
 
     def corrected(self, stamp_ns: int, odom_T_cam: F64, covariance: F64) -> F64:
         """The pose (4, 4) that the images gave, with its covariance (6, 6), corrected by the gyroscope and at rest."""
