@@ -106,7 +106,8 @@ def _order(path: Path, otherwise: tuple[int, ...]) -> tuple[int, ...]:
         StereoSfmError: the columns are angles.
     """
     names = _names(path)
-    found = [re.search(r"\bq(?:u[a-z]*)?(?:_[a-z]*)?[_. ]?([xyzw])$", name) for name in names]
+    quaternion = r"(?:\bq(?:u[a-z]*)?(?:_[a-z]*)?|\b(?:rotation|orientation|rot)(?:_[a-z]*)*)[_. ]?([xyzw])$"
+    found = [re.search(quaternion, name) for name in names]
     axes = "".join(match[1] for match in found if match)
     if not axes and {"roll", "pitch", "yaw"} <= {*names}:
         raise StereoSfmError(f"{path} has angles instead of quaternions: write it in the TUM format")

@@ -37,12 +37,16 @@ def read_times(path: Path) -> Times:
         rows = [[cell] for cell in rows[0]]
     width = min(map(len, rows), default=0)
     columns = [[row[k] for row in rows] for k in range(width)]
+    names = next((column for column in columns if not any(map(_number, column))), [])
+    parts = next((both for both in itertools.pairwise(columns) if _seconds_and_rest(*both)), None)
+    if parts is not None:
+        stamps = [int(a) * 10**9 + int(b) for a, b in zip(*parts, strict=True)]
+        return Times(stamps, [Path(name).stem for name in names])
     numbers = [column for column in columns if all(map(_number, column))]
     growing = [column for column in numbers if _grows(column)] or numbers[:1]
     times = [column for column in growing if not _counts(column)] or growing
     if not times:
         raise StereoSfmError(f"{path} must have one time in seconds or a smaller unit in each line")
-    names = next((column for column in columns if not any(map(_number, column))), [])
     return Times(_stamps_ns(path, times[0]), [Path(name).stem for name in names])
 
 
@@ -63,6 +67,16 @@ def _grows(column: list[str]) -> bool:
     """Whether numbers ascend, but for a clock that was set back; exposures beside times do not."""
     up = [Decimal(b) > Decimal(a) for a, b in itertools.pairwise(column)]
     return 10 * sum(up) >= 9 * len(up)
+
+
+def _seconds_and_rest(seconds: list[str], rest: list[str]) -> bool:
+    """Whether two columns are whole seconds, as of several images each, and the nanoseconds since then."""
+    if not all(text.isdecimal() for text in (*seconds, *rest)) or len({*seconds}) == len(seconds):
+        return False
+    if max(map(int, rest)) >= 10**9 or len({*rest}) == 1:
+        return False
+    joined = [str(int(a) * 10**9 + int(b)) for a, b in zip(seconds, rest, strict=True)]
+    return _grows(joined) and not _counts(rest)
 
 
 def _counts(column: list[str]) -> bool:

@@ -19,6 +19,7 @@ from stereo_sfm.calib.formats.common import (
     write_yaml,
 )
 from stereo_sfm.calib.formats.imu_files import imu_T_left, read_imu, write_kalibr_imu
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -53,10 +54,14 @@ def read_kalibr(
         left = _camera(first)
         left_T_imu = _cam_T_imu(first, unit)
         body_T_left = np.eye(4) if left_T_imu is None else se3.inverse(left_T_imu)
-        files = [path.with_name(name) for name in IMU_FILES] if imu_file is None else [imu_file]
+        beside = (*IMU_FILES, path.name.replace("camchain-imucam", "imu"))
+        files = [path.with_name(name) for name in beside] if imu_file is None else [imu_file]
+        files = [file for file in files if file != path]
         file, imu = next((f for f in files if f.is_file()), None), None
         if file is not None and left_T_imu is not None:
             imu = read_imu(file, left_T_imu, float(first.get("timeshift_cam_imu", 0.0)))
+        elif left_T_imu is not None and "timeshift_cam_imu" in first:  # calibrated with an IMU, of usual noise
+            imu = Imu(left_T_imu, offset_s=float(first["timeshift_cam_imu"]))
         if second is None:
             if pair != (0, 1):
                 raise KeyError(f"cam{pair[1]}")

@@ -15,11 +15,21 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.types import F64
 
-_NAMES = {  # our name -> common spellings
+_NAMES: dict[str, tuple[str, ...]] = {  # our name -> common spellings
     "M1": ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL", "camera_matrix", "cameraMatrix"),
     "M2": ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR"),
-    "D1": ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL", "distortion_coefficients", "distCoeffs"),
-    "D2": ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR"),
+    "D1": (
+        "D1",
+        "distCoeffs1",
+        "dist_coeffs_left",
+        "distortion_coefficients_left",
+        "distCoeffsL",
+        "distortion_coefficients",
+        "distCoeffs",
+        "dist_coeffs",
+        "dist_coeff",
+    ),
+    "D2": ("D2", "distCoeffs2", "dist_coeffs_right", "distortion_coefficients_right", "distCoeffsR"),
     "R": ("R", "rotation"),
     "T": ("T", "translation"),
 }
@@ -110,6 +120,9 @@ def _matrices(path: Path) -> dict[str, Any]:
     if size is not None:
         data["size"] = numbers(size, 2)
     data["model"] = storage.get("distortion_model")
+    other = [name for name in storage if "dist" in name.lower() and name != "distortion_model"]
+    if "D1" not in data and "M1" in data and other:
+        raise ValueError(f"the distortion is not called D1, but {', '.join(other)}: rename it")
     if len(data.get("R", [])) == 3:
         data["R"] = se3.so3_exp(np.array(data["R"])).ravel()
     return data

@@ -62,6 +62,11 @@ def write_ros(rig: Rig, folder: Path) -> None:
 def _info(path: Path) -> CameraInfo:
     with reading(path, "ROS camera_info"):
         data = read_yaml(path)
+        other = [
+            name for name in data if "dist" in name and name not in ("distortion_model", "distortion_coefficients")
+        ]
+        if "distortion_coefficients" not in data and other:
+            raise ValueError(f"the distortion is not called distortion_coefficients, but {', '.join(other)}: rename it")
         return info_from_rows(
             data["image_width"],
             data["image_height"],

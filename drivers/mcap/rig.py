@@ -22,6 +22,7 @@ from stereo_sfm.types import F64
 log = logging.getLogger("stereo_sfm")
 
 _OTHERWISE = "give a calibration with --rig FILE"
+_DRAWN = 1e-6  # radians between two cameras below which nothing measured them
 _SAME_LENGTH = 0.02  # share by which P's baseline and that of the transforms may differ, both being rounded
 Warn = Callable[..., None]  # as `Logger.warning`
 _PARALLEL_DEG = 45.0  # cameras of a pair see the same; axes of a camera's body are turned by 90 from its optical ones
@@ -61,7 +62,8 @@ def stereo_rig(
 ) -> Rig:
     """The rig of both cameras with the extrinsics; what is odd about it goes to `warn`.
 
-    The transforms between the cameras' frames go before R and P of raw images, after P of rectified ones.
+    The transforms between the cameras' frames go before R and P of raw images, unless they are a drawing's (parallel)
+    and R was measured, and after P of rectified ones.
 
     Raises:
         StereoSfmError: a damaged message, or extrinsics neither in the transforms nor in P.
@@ -75,6 +77,9 @@ def stereo_rig(
         stated = extrinsics(left, right, rectified)
     known = list(transforms)
     measured = chain(known, left.frame, right.frame)
+    if measured is not None and stated is not None and not rectified and _nominal(measured, stated, left, right):
+        warn("%s and %s: their transform says parallel, R and P say how they were calibrated, which counts", *topics)
+        measured = None
     if measured is None and stated is None:
         raise StereoSfmError(_missing(left, right, topics, known))
     if stated is not None and (measured is None or rectified):
@@ -107,6 +112,12 @@ def _missing(left: CameraInfo, right: CameraInfo, topics: tuple[str, str], trans
             f"{topics[1]} has no baseline ({there}): {_OTHERWISE}"
         )
     return f"no transform from '{left.frame}' to '{right.frame}' ({there}) and no baseline in {topics[1]}: {_OTHERWISE}"
+
+
+def _nominal(transform: F64, stated: F64, left: CameraInfo, right: CameraInfo) -> bool:
+    """Whether a transform is of a robot's drawing, while R and P are of a calibration: lenses are never parallel."""
+    measured = (left.checked().r != np.eye(3)).any() or (right.checked().r != np.eye(3)).any()
+    return bool(measured and se3.extent(transform)[1] < _DRAWN < se3.extent(stated)[1])
 
 
 def _with_rotation(

@@ -76,7 +76,8 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
         if name and name not in image_topics:
             raise StereoSfmError(f"{reader.path} has no image topic {name} (there are: {', '.join(image_topics)})")
     cameras = tuple(t.topic for t in rows if t.schema in CAMERAS)
-    candidates = [t for t in image_topics if not _is_depth(t)]
+    seen = [t for t in image_topics if not _is_depth(t)]
+    candidates = [t for t in seen if not any(t.startswith(f"{other}/") for other in seen)]  # one image's transports
     if not left:
         left, found = _pair(str(reader.path), candidates or image_topics, cameras)
         right = right or ("" if depth else found)

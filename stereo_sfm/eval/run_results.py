@@ -90,8 +90,11 @@ def write_results(
 
 
 def scale_free(config: Config, rig: Rig) -> bool:
-    """Whether the scale of a run is unknown: one camera, and no other source of scale."""
-    return config.odometry.monocular or (not rig.stereo and config.odometry.scale == "unit")
+    """Whether the scale of a run is unknown: of one camera (PnP takes no other source of it), or of unit steps."""
+    o = config.odometry
+    if o.method == "pnp":
+        return o.monocular or not rig.stereo
+    return o.scale == "unit" and (o.method == "eight-point" or not rig.stereo)
 
 
 def _evaluate(estimates: dict[str, Trajectory], reference: Trajectory | None, best: str) -> dict[str, Evaluation]:

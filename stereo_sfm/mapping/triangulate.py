@@ -127,6 +127,8 @@ def refine_points(points, rays, origins, trials, starts, rot, pos, rows, cameras
             if cost < lowest:
                 lowest = cost
                 _copy(y, x)
+        if not math.isfinite(lowest):  # x is the point before it
+            continue
         damping = 1e-3
         cost = _cost(x, first, last, rot, pos, rows, cameras, math.inf, True, m, h, b)
         for _ in range(steps):

@@ -39,7 +39,7 @@ class FeatureTracker(DescriptorTracker):
         self._scale = StepScale(config.odometry, ground_truth)
         self._last: FeatureView | None = None
         self._odom_T_last = np.eye(4)
-        self._last_stamp = 0
+        self._last_stamp = self._kf_stamp = 0
 
     def apply(self, update: MapUpdate) -> None:
         """Take over fused ids and, for motions from a keyframe, the map's positions of its points."""
@@ -99,16 +99,16 @@ class FeatureTracker(DescriptorTracker):
     ) -> tuple[Motion, FeatureView] | Degenerate:
         """Motion from the reference, with the view's ids filled in, or why there is none."""
         assert self._last is not None and self._keyframe is not None
-        reference, odom_T_reference = self._last, self._odom_T_last
+        reference, odom_T_reference, since = self._last, self._odom_T_last, self._last_stamp
         if self._odometry.reference == "keyframe":
-            reference, odom_T_reference = self._keyframe, self._odom_T_kf
+            reference, odom_T_reference, since = self._keyframe, self._odom_T_kf, self._kf_stamp
         rows = self._match(reference.features, view.features)
         if self._config.features.motion_check:
             rays = reference.bearings[rows[:, 0]], view.bearings[rows[:, 1]]
             rows = rows[epipolar_inliers(*rays, 2 * self._config.features.epipolar_px * self._pixel, rng)]
         try:
             motion = self._estimator(_pair(reference, view, rows, self._pixel), rng)
-            motion = self._scale.metric(motion, self._last_stamp, image.stamp_ns)
+            motion = self._scale.metric(motion, since, image.stamp_ns)
         except Degenerate as refusal:
             return refusal
         reference_T_now = se3.inverse(se3.from_rotation_translation(motion.rotation, motion.translation))
@@ -175,6 +175,7 @@ class FeatureTracker(DescriptorTracker):
 
     def _make_keyframe(self, image: StereoImage, view: FeatureView) -> Keyframe:
         keyframe = self._enter(view, image.stamp_ns, self._odom_T_cam)
+        self._kf_stamp = image.stamp_ns
         if self._place_corners is None:
             return keyframe
         return replace(keyframe, corners=self._place_corners.find(image))

@@ -145,7 +145,12 @@ class MonocularTracker(DescriptorTracker):
         if self._force_keyframe or inliers < o.keyframe_rescue_inliers:
             self._force_keyframe = False
             return True
-        return self._frames_since_kf > o.keyframe_min_frames and inliers < o.keyframe_min_inliers
+        if self._frames_since_kf <= o.keyframe_min_frames:
+            return False
+        if o.keyframe_frames and self._frames_since_kf >= o.keyframe_frames:
+            return True
+        known = int(np.isfinite(self._keyframe.points[:, 2]).sum()) if self._keyframe is not None else 0
+        return inliers < (o.keyframe_min_inliers or o.keyframe_ratio * max(known, 1))
 
     def _new_keyframe_view(self, view: FeatureView, rows: I64, rng: np.random.Generator) -> FeatureView:
         """Known points found again, then new ones from the matches with the last keyframe that have none yet."""

@@ -83,11 +83,18 @@ class StepScale:
         self._truth = ground_truth
 
     def metric(self, motion: Motion, last_stamp_ns: int, stamp_ns: int) -> Motion:
-        """The motion with a length; unchanged where it has one."""
+        """The motion with a length; unchanged where it has one.
+
+        Raises:
+            Degenerate: "no_scale".
+        """
         if motion.metric:
             return motion
         step = 1.0
         if self._kind == "ground-truth" and self._truth is not None:
+            known = self._truth.stamp_ns[[0, -1]]
+            if not (known[0] <= last_stamp_ns and stamp_ns <= known[1]):
+                raise Degenerate("no_scale", "the ground truth does not cover this step")
             step = float(np.linalg.norm(self._position(stamp_ns) - self._position(last_stamp_ns)))
         return replace(motion, translation=step * motion.translation, metric=True)
 

@@ -28,6 +28,8 @@ def make_tracker(
         raise StereoSfmError(
             "one camera has no scale: choose --set odometry.scale=unit (steps of one metre) or ground-truth"
         )
+    if method == "eight-point" and config.odometry.scale == "unit" and config.odometry.reference == "keyframe":
+        raise StereoSfmError("steps of one metre are from image to image: choose --set odometry.reference=frame")
     if method == "pnp" and (config.odometry.monocular or not rig.stereo):
         from stereo_sfm.papers.monocular import MonocularTracker
 

@@ -178,3 +178,15 @@ def test_numbered_files_without_a_baseline_are_no_pair(tmp_path: Path, caplog: p
         _write(tmp_path, name, pair()[0])
     assert load_rig(tmp_path / "webcam_2024_1.yaml").right is None
     assert "are no pair (P of the second has no Tx)" in caplog.text
+
+
+def test_a_drawing_of_the_robot_does_not_replace_a_calibration(caplog: pytest.LogCaptureFixture) -> None:
+    """Its cameras are parallel and a round number apart; R and P say how they were calibrated."""
+    left, right = pair()
+    drawn = Transform(0, "cam_l", "cam_r", se3.exp(np.array([0.06, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    rig = stereo_rig(left, right, TOPICS, False, [drawn])
+    np.testing.assert_allclose(rig.left_T_right, RIG.left_T_right, atol=1e-12)
+    assert "R and P say how they were calibrated" in caplog.text
+    measured = Transform(0, "cam_l", "cam_r", RIG.left_T_right @ se3.exp(np.array([0, 0, 0, 0.001, 0, 0])))
+    rig = stereo_rig(left, right, TOPICS, False, [measured])
+    np.testing.assert_array_equal(rig.left_T_right, measured.matrix)

@@ -17,6 +17,7 @@ from stereo_sfm.calib.formats.kalibr import read_kalibr
 from stereo_sfm.calib.formats.kapture import read_kapture
 from stereo_sfm.calib.formats.kitti import read_kitti
 from stereo_sfm.calib.formats.opencv import read_opencv
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import (
@@ -403,3 +404,32 @@ def test_texts_that_stand_for_more_than_a_calibration(tmp_path: Path, name: str,
     with pytest.raises(StereoSfmError, match=says) as error:
         load_rig(tmp_path / name)
     assert "\n" not in str(error.value)
+
+
+def test_kalibrs_chain_of_cameras_and_imu_alone(tmp_path: Path) -> None:
+    """The IMU's pose and time are in it; its noise is in a file of the same beginning, or as usual."""
+    save_rig(
+        replace(RADTAN, imu=Imu(se3.inverse(BODY), offset_s=0.0123, gyro_noise=3e-4)),
+        tmp_path / "camchain.yaml",
+        "kalibr",
+    )
+    chain = tmp_path / "camchain.yaml"
+    chain.rename(tmp_path / "walk-camchain-imucam.yaml")
+    (tmp_path / "imu.yaml").rename(tmp_path / "walk-imu.yaml")
+    rig = read_kalibr(tmp_path / "walk-camchain-imucam.yaml")
+    assert rig.imu is not None and rig.imu.gyro_noise == 3e-4
+    (tmp_path / "walk-imu.yaml").unlink()
+    rig = read_kalibr(tmp_path / "walk-camchain-imucam.yaml")
+    assert rig.imu is not None and rig.imu.offset_s == pytest.approx(0.0123)
+    np.testing.assert_allclose(rig.imu.left_T_imu, se3.inverse(BODY), atol=1e-12)
+
+
+def test_distortion_of_another_name_is_no_ideal_lens(tmp_path: Path) -> None:
+    save_rig(RADTAN, tmp_path / "a.yml", "opencv")
+    text = (tmp_path / "a.yml").read_text()
+    for name in ("distortion_coefficients_left", "dist_coeffs"):
+        (tmp_path / "b.yml").write_text(text.replace("D1:", f"{name}:"))
+        assert read_opencv(tmp_path / "b.yml").left.distortion == RADTAN.left.distortion
+    (tmp_path / "b.yml").write_text(text.replace("D1:", "distortion_coefficents:"))
+    with pytest.raises(StereoSfmError, match="the distortion is not called D1, but distortion_coefficents"):
+        read_opencv(tmp_path / "b.yml")

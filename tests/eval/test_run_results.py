@@ -80,6 +80,15 @@ def test_gravity_of_a_saved_map_has_no_sigma_of_this_run(tmp_path: Path) -> None
 def test_one_camera_is_evaluated_after_scale_alignment(tmp_path: Path) -> None:
     config = Config(odometry=dataclasses.replace(Config().odometry, method="pnp", monocular=True))
     assert scale_free(config, pinhole_rig())
+    one = dataclasses.replace(pinhole_rig(), right=None, left_T_right=np.eye(4))
+    assert scale_free(Config(odometry=dataclasses.replace(Config().odometry, method="pnp")), one)
+    for method, other in (("flow", {"monocular": True}), ("em-r", {"monocular": True}), ("eight-point", {})):
+        assert not scale_free(
+            Config(odometry=dataclasses.replace(Config().odometry, method=method, **other)), pinhole_rig()
+        )
+    assert scale_free(
+        Config(odometry=dataclasses.replace(Config().odometry, method="eight-point", scale="unit")), pinhole_rig()
+    )
     _, lines, report = results(tmp_path, record_of(camera_path(), 0), pinhole_rig(), config)
     assert any("one camera has no scale" in line for line in lines) and "baseline" not in report
     assert not any("SE3" in line for line in lines)
