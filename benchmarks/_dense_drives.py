@@ -29,7 +29,7 @@ from stereo_sfm.drivers.sim.kernels import FACING
 from stereo_sfm.drivers.sim.render import Renderer
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
-from stereo_sfm.maps.floor import find_floor
+from stereo_sfm.maps.floor import floor_of
 from stereo_sfm.types import F64, Bool
 
 NEAR_M, CLOSE_M = 2.5, 0.05  # what is measured; of the F-score and of covered surface
@@ -94,7 +94,7 @@ def _beside_open3d(
     """
     truth, truth_T_floor = given
     saved, voxel = find_input(run).saved, 0.02
-    floor_T_map = se3.inverse(find_floor(saved.snapshot, saved.rig.base_T_left[2, :3]))
+    floor_T_map = se3.inverse(floor_of(saved))
     seen = [
         Seen(depth, floor_T_map @ saved.snapshot.map_T_kf[int(path.stem)], 0)
         for path in sorted((run / "surface" / "depth").glob("*.npz"))

@@ -18,7 +18,7 @@ import numpy as np
 from stereo_sfm.drivers.repeated import shifted
 from stereo_sfm.drivers.source import Stamps
 from stereo_sfm.drivers.wrapped import WrappedSource
-from stereo_sfm.types import StereoImage, Trajectory
+from stereo_sfm.types import I64, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -100,6 +100,18 @@ def _stamped(image: StereoImage, stamp_ns: int) -> StereoImage:
     return image if not shift_ns else shifted(image, image.frame_id, shift_ns)
 
 
+def _kept(stamp_ns: I64) -> tuple[list[int], I64]:
+    """Rows of stamps (N,) that are not skipped, and the ascending stamps that they get."""
+    clock, rows, stamps, waiting = AscendingStamps(), list[int](), list[int](), list[int]()
+    for k, stamp in enumerate(stamp_ns.tolist()):
+        waiting.append(k)
+        if good := clock.step(stamp):
+            rows.extend(waiting[-len(good) :])
+            stamps.extend(good)
+            waiting = []
+    return rows, np.array(stamps, np.int64)
+
+
 class AscendingSource(WrappedSource):
     """Wraps a source: its images with ascending stamps."""
 
@@ -109,22 +121,14 @@ class AscendingSource(WrappedSource):
         truth = self.source.ground_truth
         if truth is None or (np.diff(truth.stamp_ns) > 0).all():
             return truth
-        clock, rows, stamps, waiting = AscendingStamps(), list[int](), list[int](), list[int]()
-        for k, stamp_ns in enumerate(truth.stamp_ns.tolist()):
-            waiting.append(k)
-            if good := clock.step(stamp_ns):
-                rows.extend(waiting[-len(good) :])
-                stamps.extend(good)
-                waiting = []
-        return Trajectory(np.array(stamps, np.int64), truth.poses[rows], truth.oriented)
+        rows, stamps = _kept(truth.stamp_ns)
+        return Trajectory(stamps, truth.poses[rows], truth.oriented)
 
     def stamps(self) -> Stamps | None:
         found = self.source.stamps()
         if found is None or (np.diff(found.stamp_ns) > 0).all():
             return found
-        clock = AscendingStamps()
-        stamps = [t for stamp_ns in found.stamp_ns.tolist() for t in clock.step(stamp_ns)]
-        return replace(found, stamp_ns=np.array(stamps, np.int64))
+        return replace(found, stamp_ns=_kept(found.stamp_ns)[1])
 
     def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
         found = self.source.stamps()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -107,6 +107,13 @@ def numbers(values: Any, count: int | None = None) -> list[float]:
     if not np.isfinite(flat).all():
         raise ValueError("a number is not finite")
     return [float(v) for v in flat]
+
+
+def no_other_distortion(names: Iterable[str], wanted: str) -> None:
+    """Raises ValueError where a file without `wanted` has a distortion of another name: the lens is not ideal."""
+    other = [name for name in names if "dist" in name.lower() and name != "distortion_model"]
+    if other:
+        raise ValueError(f"the distortion is not called {wanted}, but {', '.join(other)}: rename it")
 
 
 def rigid(values: Any, unit: float = 1.0) -> F64:

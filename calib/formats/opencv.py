@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from stereo_sfm.calib.formats.common import brown, exact_rotation, numbers, padded, reading, unsupported
+from stereo_sfm.calib.formats.common import (
+    brown,
+    exact_rotation,
+    no_other_distortion,
+    numbers,
+    padded,
+    reading,
+    unsupported,
+)
 from stereo_sfm.calib.formats.file_storage import matrix, read_storage
 from stereo_sfm.calib.lens_doubts import believable
 from stereo_sfm.calib.rig import Rig
@@ -120,9 +128,8 @@ def _matrices(path: Path) -> dict[str, Any]:
     if size is not None:
         data["size"] = numbers(size, 2)
     data["model"] = storage.get("distortion_model")
-    other = [name for name in storage if "dist" in name.lower() and name != "distortion_model"]
-    if "D1" not in data and "M1" in data and other:
-        raise ValueError(f"the distortion is not called D1, but {', '.join(other)}: rename it")
+    if "D1" not in data and "M1" in data:
+        no_other_distortion(storage, "D1")
     if len(data.get("R", [])) == 3:
         data["R"] = se3.so3_exp(np.array(data["R"])).ravel()
     return data

@@ -13,7 +13,7 @@ from stereo_sfm.calib.formats.camera_info import (
     infos_from_rig,
     rig_from_infos,
 )
-from stereo_sfm.calib.formats.common import read_yaml, reading, write_yaml
+from stereo_sfm.calib.formats.common import no_other_distortion, read_yaml, reading, write_yaml
 from stereo_sfm.calib.formats.pair_files import left_files, partner
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.input_file import visible
@@ -62,11 +62,8 @@ def write_ros(rig: Rig, folder: Path) -> None:
 def _info(path: Path) -> CameraInfo:
     with reading(path, "ROS camera_info"):
         data = read_yaml(path)
-        other = [
-            name for name in data if "dist" in name and name not in ("distortion_model", "distortion_coefficients")
-        ]
-        if "distortion_coefficients" not in data and other:
-            raise ValueError(f"the distortion is not called distortion_coefficients, but {', '.join(other)}: rename it")
+        if "distortion_coefficients" not in data:
+            no_other_distortion(data, "distortion_coefficients")
         return info_from_rows(
             data["image_width"],
             data["image_height"],

@@ -179,22 +179,9 @@ def _write_trajectories(options: ExportOptions, output: Path) -> list[Path]:
     found, what = _trajectories(options)
     paths = [output if len(found) == 1 else _of_session(output, session) for session in found]
     _check_free(options, paths)
-    lines = options.source / f"trajectory_{options.which}.kitti"  # of a run: one for every frame, also for lost ones
     for path, trajectory in zip(paths, found.values(), strict=True):
-        if options.format == "kitti" and lines.is_file():
-            _copy(lines, path)
-        else:
-            export_trajectory(trajectory, path, options.format, what)
+        export_trajectory(trajectory, path, options.format, what)
     return paths
-
-
-def _copy(file: Path, path: Path) -> None:
-    from stereo_sfm.errors import writing_to
-    from stereo_sfm.input_file import read_text
-
-    with writing_to(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(read_text(file), encoding="utf-8")
 
 
 def _of_session(path: Path, session: int) -> Path:
@@ -205,7 +192,7 @@ def _of_session(path: Path, session: int) -> Path:
 
 def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:
     """A run's trajectory, or a map's keyframes by session; and which poses they are."""
-    from stereo_sfm.drivers.ground_truth import read_trajectory
+    from stereo_sfm.drivers.ground_truth import read_kitti, read_trajectory
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.export.keyframe_images import check_session
     from stereo_sfm.export.trajectories import named_pose
@@ -215,7 +202,10 @@ def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:
     if (options.source / name).is_file():
         if options.session is not None:
             raise StereoSfmError("--session goes with maps: a run is one session")
-        return {0: read_trajectory(options.source / name)}, named_pose(options.source / name)
+        what, lines = named_pose(options.source / name), (options.source / name).with_suffix(".kitti")
+        if options.format == "kitti" and lines.is_file():  # which has one for lost frames, too
+            return {0: read_kitti(lines)}, what
+        return {0: read_trajectory(options.source / name)}, what
     if not (options.source / "map.json").is_file():
         raise StereoSfmError(f"{options.source} holds no {name}: name the folder of a run or of a map")
     if options.which == "odom":

@@ -12,7 +12,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.keyframe_images import open_recording, session_of_recording
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
-from stereo_sfm.maps.floor import find_floor
+from stereo_sfm.maps.floor import floor_of
 from stereo_sfm.maps.saved_map import SavedMap, load_map
 from stereo_sfm.maps.store import read_about
 from stereo_sfm.types import F64
@@ -39,7 +39,7 @@ class DenseInput:
         """
         if self.store is not None:
             return read_about(self.store, self.saved).map_T_floor
-        return find_floor(self.saved.snapshot, self.saved.rig.base_T_left[2, :3])
+        return floor_of(self.saved)
 
 
 def find_input(folder: Path, images: Sequence[str] = (), rig: Path | None = None) -> DenseInput:

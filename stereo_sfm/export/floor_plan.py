@@ -17,7 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.mapping.snapshot import MapSnapshot
-from stereo_sfm.maps.floor import HIGH, LOW, find_floor
+from stereo_sfm.maps.floor import HIGH, LOW, find_floor, floor_of
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, I32, U8
 
@@ -180,7 +180,6 @@ def write_floor_plan(plan: FloorPlan, path: Path) -> None:
 
 def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> FloorPlan:
     """Make the floor plan of a map and write it."""
-    map_T_floor = find_floor(saved.snapshot, saved.rig.base_T_left[2, :3])
-    plan = make_floor_plan(saved.snapshot, resolution, map_T_floor)
+    plan = make_floor_plan(saved.snapshot, resolution, floor_of(saved))
     write_floor_plan(plan, path)
     return plan

@@ -150,9 +150,8 @@ class KeyframeGraph:
 
     def unbroken(self, a: int, b: int) -> bool:
         """Whether odometry connects two keyframes without interruption."""
-        row_a, row_b, nodes = self._row(a), self._row(b), self._nodes
-        known = row_a < len(nodes) and nodes.kf_id[row_a] == a
-        return bool(known and nodes.submap[row_a] == nodes.submap[row_b])
+        submap = self._nodes.submap
+        return self._known(a) and bool(submap[self._row(a)] == submap[self._row(b)])
 
     def same_view(self, kf_id: int, factor: float = 1.0) -> list[int]:
         """Keyframes with about the same pose, this one included, oldest first; within `factor` times the distance."""

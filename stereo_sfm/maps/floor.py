@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,10 +13,18 @@ from stereo_sfm.geometry.dominant_direction import dominant_direction
 from stereo_sfm.mapping.snapshot import MapSnapshot
 from stereo_sfm.types import F64, Bool
 
+if TYPE_CHECKING:
+    from stereo_sfm.maps.saved_map import SavedMap
+
 LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
 BELOW_M = 0.2  # metres below the camera at which a floor can be
 FEW = 20  # points, fewer show no plane
 THICK_M = 0.05  # metres, of a level: stereo points of a floor a metre or two away scatter by a few centimetres
+
+
+def floor_of(saved: SavedMap) -> F64:
+    """map_T_floor (4, 4) of a saved map, as `find_floor`, by the axes of its newest session's robot."""
+    return find_floor(saved.snapshot, saved.rig.base_T_left[2, :3])
 
 
 def find_floor(s: MapSnapshot, up: F64 | None = None) -> F64:

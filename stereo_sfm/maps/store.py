@@ -20,7 +20,7 @@ import yaml
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.input_file import read_bytes, read_yaml
-from stereo_sfm.maps.floor import find_floor
+from stereo_sfm.maps.floor import floor_of
 from stereo_sfm.maps.labels import Aisle, Door
 from stereo_sfm.maps.replace_folder import content
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
@@ -101,8 +101,7 @@ def read_about(store: Path, saved: SavedMap | None = None) -> About:
     """
     path = store / ABOUT
     if not path.is_file():
-        saved = load_current(store) if saved is None else saved
-        return About(0, find_floor(saved.snapshot, saved.rig.base_T_left[2, :3]))
+        return About(0, floor_of(load_current(store) if saved is None else saved))
     try:
         data: Any = read_yaml(path, MOST_ABOUT)
         aisles = tuple(Aisle(*_line(line)) for line in data["aisles"])
@@ -150,7 +149,7 @@ def write_version(
             copy_map(store, versions_folder(store) / f"{about.version:05d}")
             about = dataclasses.replace(about, version=about.version + 1)
         else:
-            about = About(0, find_floor(saved.snapshot, saved.rig.base_T_left[2, :3]))
+            about = About(0, floor_of(saved))
         lines = "".join(f"{line}\n" for line in changes)
         save_map(saved, store, _extras(store) | {ABOUT: _about_text(about), CHANGES: lines.encode()}, compress)
         # Those of a store that was here before this one, which count no more, have higher numbers and go first.

@@ -240,3 +240,15 @@ def test_a_floor_plan_with_an_invalid_resolution(
     assert len(error.splitlines()) == 1 and ("above 0 metres" in error or "pixels" in error)
     with pytest.raises(StereoSfmError):
         make_floor_plan(saved.snapshot, float(metres))
+
+
+def test_kittis_lines_of_a_run_are_its_frames_also_lost_ones(tmp_path: Path) -> None:
+    """A frame without a pose has a line, or all after it would belong to other images."""
+    (tmp_path / "trajectory_map.tum").write_text("1.0 0 0 0 0 0 0 1\n3.0 0 0 2 0 0 0 1\n")
+    lines = [f"1 0 0 0 0 1 0 0 0 0 1 {z}" for z in (0, 1, 2)]
+    (tmp_path / "trajectory_map.kitti").write_text("\n".join(lines) + "\n")
+    for which, count in (("kitti", 3), ("tum", 2)):
+        out = tmp_path / f"out.{which}"
+        assert main(["export", str(tmp_path), "--format", which, "-o", str(out)]) == 0
+        rows = [line for line in out.read_text().splitlines() if not line.startswith("#")]
+        assert len(rows) == count

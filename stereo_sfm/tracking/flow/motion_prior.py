@@ -75,7 +75,7 @@ class MotionPrior:
 
     def stale(self, stamp_ns: int) -> bool:
         """Whether no pose of the last second was trusted: any is better than one from before."""
-        return stamp_ns - self._poses[-1][0] > WINDOW_S * 1e9
+        return self._seconds(stamp_ns) > WINDOW_S
 
     def velocity(self) -> F64:
         """(6,) mean tangent a second; zero before there is motion."""
