@@ -82,7 +82,10 @@ def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
         description="Visual structure-from-motion and SLAM for stereo cameras in retail stores.",
     )
     parser.add_argument(
-        "--version", action="store_true", help="print the versions of this package and its dependencies"
+        "--version",
+        dest="print_versions",  # `map release` has a version of its own
+        action="store_true",
+        help="print the versions of this package and its dependencies",
     )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for name, text in COMMANDS.items():
@@ -146,15 +149,15 @@ def _fetched(value: object) -> object:
     from stereo_sfm.input_file import refuse_pipe
     from stereo_sfm.storage.remote import InputPath, of_path
 
-    remote = of_path(value)
-    if remote is None:
-        refuse_pipe(value)
-        return value
+    found = of_path(value)
+    if isinstance(found, Path):
+        refuse_pipe(found)
+        return found
     if not isinstance(value, InputPath):
-        raise StereoSfmError(f"{remote} cannot be here, only a path ('stereo-sfm fleet upload' sends a folder)")
+        raise StereoSfmError(f"{found} cannot be here, only a path ('stereo-sfm fleet upload' sends a folder)")
     from stereo_sfm.fleet.copies import fetched
 
-    return fetched(remote)
+    return fetched(found)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -170,7 +173,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     _start_logging(options)
     try:
-        if options.version:
+        if options.print_versions:
             _print_versions()
             return 0
         if options.command is None:

@@ -7,9 +7,13 @@ import fnmatch
 import glob
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._cluster import on_cluster
 from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from stereo_sfm.storage.remote import Remote
 
 SOME_FAILED = 3
 
@@ -58,14 +62,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _expand(patterns: list[str]) -> list[str]:
-    """Expand patterns as a shell does; paths become absolute for other nodes."""
-    from stereo_sfm.storage.remote import is_uri
+    """Expand patterns as a shell does; paths become absolute for other nodes.
+
+    Raises:
+        StereoSfmError: an address is none, or has credentials in it, which would stand in every result.
+    """
+    from stereo_sfm.storage.remote import Remote, is_uri, place
 
     out: list[str] = []
     for pattern in patterns:
-        if is_uri(pattern):
-            out += _in_bucket(pattern)
-            continue
+        head, mark, query = pattern.partition("?")
+        if is_uri(behind := head.partition(":")[2]):  # a kind of source stands before it
+            place(behind)
+        elif is_uri(head):
+            address = place(head)
+            if isinstance(address, Remote):
+                out += [name + mark + query for name in _in_bucket(address)]
+                continue
+            pattern = f"{address}{mark}{query}"
         found = sorted(glob.glob(pattern))
         if not found and any(c in pattern for c in "*[") and not pattern.startswith("sim:"):
             raise StereoSfmError(f"no recording matches {pattern}: check the folder and the pattern")
@@ -73,15 +87,13 @@ def _expand(patterns: list[str]) -> list[str]:
     return out
 
 
-def _in_bucket(pattern: str) -> list[str]:
+def _in_bucket(pattern: Remote) -> list[str]:
     """The objects that a pattern in the last part of an address means; an address without one as it is."""
     from stereo_sfm.storage import objects
-    from stereo_sfm.storage.remote import Remote
 
-    head, _, last = pattern.rpartition("/")
-    if not any(c in last for c in "*["):
-        return [pattern]
-    names = [name for name, _, _ in objects.listed(Remote.of(head)) if fnmatch.fnmatchcase(name, last)]
+    if not any(c in pattern.name for c in "*["):
+        return [str(pattern)]
+    names = [name for name, _, _ in objects.listed(pattern.parent) if fnmatch.fnmatchcase(name, pattern.name)]
     if not names:
         raise StereoSfmError(f"no recording matches {pattern}")
-    return [f"{head}/{name}" for name in names]
+    return [str(pattern.parent / name) for name in names]

@@ -176,8 +176,11 @@ def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None
     """The ground truth in a file, and that file; or of a source, opened as the run opened its own."""
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.drivers.ground_truth import read_trajectory
+    from stereo_sfm.fleet.copies import fetched
+    from stereo_sfm.storage.remote import Remote, is_uri, place
 
-    path = Path(spec).expanduser()
+    where = place(spec) if is_uri(spec) and not spec.endswith(".mcap") else Path(spec).expanduser()
+    path = fetched(where) if isinstance(where, Remote) else where
     if path.is_file() and path.suffix != ".mcap":
         return read_trajectory(path), path
     with SourceChoice(spec, opening.rig, rectify=opening.rectify)() as opened:

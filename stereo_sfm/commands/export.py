@@ -87,7 +87,14 @@ def _output(options: ExportOptions) -> Path:
     whole = options.format in ("colmap", DENSE)
     if options.output is not None and (whole or not options.output.is_dir()):
         return options.output
-    return (options.output or options.source) / _default_name(options)
+    return (options.output or _beside(options.source)) / _default_name(options)
+
+
+def _beside(source: Path) -> Path:
+    """Where files of a source go that name no place: into it; into the current folder if it is the copy of another."""
+    from stereo_sfm.storage.folders import cache_root
+
+    return Path() if source.resolve().is_relative_to(cache_root().resolve()) else source
 
 
 def _default_name(options: ExportOptions) -> str:

@@ -89,9 +89,12 @@ def _point(text: str) -> tuple[float, float]:
 
 def run(args: argparse.Namespace) -> int:
     """Run the chosen action."""
+    from stereo_sfm.fleet.versions import HEAD
     from stereo_sfm.storage.remote import Remote, place
 
     store = place(args.store)
+    if isinstance(store, Path) and (store / HEAD).is_file():  # of versions, as in a bucket
+        store = Remote("file", "", str(store.resolve()).strip("/"))
     if args.action == "update" and args.keep < 1:
         raise StereoSfmError("--keep must be at least 1")
     if args.action in ("release", "fetch") and not isinstance(store, Remote):
@@ -132,13 +135,13 @@ def _update(store: Path, walks: list[str], config: Config, keep: int) -> int:
 
 def mapped(name: str, config: Config) -> SavedMap:
     """The session's own map: of a map or run folder, or of a run over the source made now."""
+    from stereo_sfm.fleet.copies import fetched
     from stereo_sfm.maps.saved_map import load_map
-    from stereo_sfm.storage.folders import fetch
     from stereo_sfm.storage.remote import Remote, is_uri, place
 
     if is_uri(name) and not name.endswith(".mcap"):
         found = place(name)
-        name = str(fetch(found) if isinstance(found, Remote) else found)
+        name = str(fetched(found) if isinstance(found, Remote) else found)
     for folder in (Path(name), Path(name) / "map"):
         if (folder / "map.json").is_file():
             return load_map(folder)

@@ -11,7 +11,7 @@ from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 SCHEMES = ("s3", "gs", "az", "file")
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_COLLAPSED = re.compile(rf"({'|'.join(SCHEMES)}):/")
+_COLLAPSED = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/")
 _URI = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://(.*)", re.DOTALL)
 
 
@@ -28,7 +28,7 @@ class Remote:
         """Parse a URI.
 
         Raises:
-            StereoSfmError: an unknown scheme, no bucket, or credentials in it.
+            StereoSfmError: an unknown scheme, no bucket, or credentials in it, which are not printed.
         """
         found = _URI.fullmatch(uri)
         if found is None:
@@ -42,6 +42,8 @@ class Remote:
         bucket, _, key = rest.partition("/")
         if "@" in bucket:
             raise StereoSfmError(f"{scheme}:// takes no credentials in an address: set them in the environment")
+        if "?" in key:
+            raise StereoSfmError(f"{scheme}://{bucket}/...: an address has no '?', and signatures have no place in it")
         if scheme == "file":
             if bucket not in ("", "localhost"):
                 raise StereoSfmError(f"file://{rest}: a path on this computer begins with three slashes: file:///PATH")
@@ -84,14 +86,17 @@ class InputPath(PosixPath):
     """The path of what a command reads: it may also be an address."""
 
 
-def of_path(path: Path) -> Remote | None:
-    """The address that was taken for a path, which has lost one of its slashes; None: it is a path.
+def of_path(path: Path) -> Place:
+    """What a path means that may be an address, which has lost one of its slashes: that, or a path.
 
     Raises:
         StereoSfmError: as `Remote.of`.
     """
     found = _COLLAPSED.match(str(path))
-    return Remote.of(f"{found[1]}://{str(path)[found.end() :]}") if found else None
+    if found is None or Path(found[1]).exists():
+        return path
+    slashes = "///" if found[1].lower() == "file:" else "//"
+    return place(f"{found[1]}{slashes}{str(path)[found.end() :]}")
 
 
 def is_uri(text: str) -> bool:
