@@ -40,8 +40,8 @@ def test_no_command_takes_the_name_of_another_option() -> None:
 
 def _choices(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
     """The commands below a parser."""
-    below = [a.choices for a in parser._actions if isinstance(a.choices, dict)]
-    return dict(below[0]) if below else {}
+    below = [a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    return dict(*below)
 
 
 def test_a_version_is_released_to_a_robot(saved: Path, place: str, tmp_path: Path) -> None:
