@@ -16,8 +16,13 @@ from stereo_sfm.types import F64
 Graph = Any
 
 
-def _noise(dimension: int, huber: float) -> Any:
+DEPTH = np.array([[1.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1.0]])  # (u, computed u of the right image, v) px^2
+
+
+def _noise(dimension: int, huber: float, depth: bool = False) -> Any:
     plain = gtsam.noiseModel.Isotropic.Sigma(dimension, 1.0)
+    if depth:
+        plain = gtsam.noiseModel.Gaussian.Covariance(DEPTH)
     if huber <= 0:
         return plain
     return gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(huber), plain)
@@ -29,7 +34,7 @@ def stereo_graph(rig: Rig, bundle: Bundle, huber: float = 0.0) -> Graph:
     stereo = gtsam.Cal3_S2Stereo(cam.fx, cam.fy, 0, cam.cx, cam.cy, rig.baseline)
     mono = gtsam.Cal3_S2(cam.fx, cam.fy, 0, cam.cx, cam.cy)
     graph = gtsam.NonlinearFactorGraph()
-    noise3, noise2 = _noise(3, huber), _noise(2, huber)
+    noise3, noise2 = _noise(3, huber, rig.depth), _noise(2, huber)
     for k, p, left, right in zip(bundle.obs_kf, bundle.obs_pt, bundle.uv_left, bundle.uv_right, strict=True):
         x, landmark = gtsam.symbol("x", int(k)), gtsam.symbol("l", int(p))
         if np.isfinite(right[0]):

@@ -85,6 +85,9 @@ class Rows(NamedTuple):
 def linearize(own, rot, pos, points, rows, trust, use, limit, cameras, scale, redescends, joint, out):
     """Residuals and their quadratic model at one state.
 
+    What a depth camera measures beside the pixel is the disparity, u of the right image less that of the left: the
+    computed right pixel has the left one's error.
+
     Args:
         own: (N,) those of the rows. rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world. rows: Rows.
         cameras: StereoCameras.
@@ -119,6 +122,11 @@ def linearize(own, rot, pos, points, rows, trust, use, limit, cameras, scale, re
         )
         u0, u1, u2 = u0 * r00 + u1 * r10 + u2 * r20, u0 * r01 + u1 * r11 + u2 * r21, u0 * r02 + u1 * r12 + u2 * r22
         v0, v1, v2 = v0 * r00 + v1 * r10 + v2 * r20, v0 * r01 + v1 * r11 + v2 * r21, v0 * r02 + v1 * r12 + v2 * r22
+        if cameras.depth and weights[o, 0] > 0 and max(chi_l, chi_r) < UNPROJECTABLE:
+            s = weights[o, 1] / weights[o, 0]
+            u0, u1, u2, su = u0 - s * x0, u1 - s * x1, u2 - s * x2, su - s * ru
+            v0 = v1 = v2 = sv = 0.0
+            chi_r = su * su
         chi2[o, 0], chi2[o, 1] = chi_l, chi_r
         if limit > 0:
             use[o, 0], use[o, 1] = weights[o, 0] > 0 and chi_l <= limit, weights[o, 1] > 0 and chi_r <= limit

@@ -40,7 +40,9 @@ def rig(request: pytest.FixtureRequest) -> Rig:
     return pinhole_rig() if request.param == "pinhole" else fisheye_rig()
 
 
-def test_noise_free_scene_returns_to_truth(rig: Rig) -> None:
+@pytest.mark.parametrize("depth", [False, True])
+def test_noise_free_scene_returns_to_truth(rig: Rig, depth: bool) -> None:
+    rig = dataclasses.replace(rig, depth=depth)
     scene = make_scene(rig, 6, 300, noise_px=0.0)
     result = bundle_adjust(rig, bundle_of(scene), TIGHT)
     assert result.cost < 1e-12
@@ -50,9 +52,11 @@ def test_noise_free_scene_returns_to_truth(rig: Rig) -> None:
     assert result.converged
 
 
+@pytest.mark.parametrize("depth", [False, True])
 @pytest.mark.parametrize("huber", [0.0, 1.345])
-def test_agrees_with_gtsam_on_rectified_stereo(huber: float) -> None:
-    rig = pinhole_rig()
+def test_agrees_with_gtsam_on_rectified_stereo(huber: float, depth: bool) -> None:
+    """A depth camera's computed right pixel has the error of the left one besides its own."""
+    rig = dataclasses.replace(pinhole_rig(), depth=depth)
     scene = stereo_only_u(make_scene(rig, 5, 150, noise_px=0.7, outliers=0.03 if huber else 0.0))
     bundle = bundle_of(scene)
     graph = gtsam_oracle.stereo_graph(rig, bundle, huber)

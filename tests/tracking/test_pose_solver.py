@@ -23,8 +23,8 @@ SCALES = np.array([20.0, 10.0, 5.0, 3.0, 2.0, 2.0, 2.0, 2.0])
 NO_PRIOR = np.eye(4), np.full(6, np.inf)
 
 
-def rig(camera: Camera) -> Rig:
-    return Rig(camera, camera, se3.exp(np.array([0.1, 0.002, -0.001, 0.01, -0.02, 0.005])))
+def rig(camera: Camera, depth: bool = False) -> Rig:
+    return Rig(camera, camera, se3.exp(np.array([0.1, 0.002, -0.001, 0.01, -0.02, 0.005])), depth=depth)
 
 
 def scene(camera: Camera, count: int, seed: int) -> tuple[F64, F64, F64, F64]:
@@ -51,8 +51,9 @@ def solve(
     uv_right: F64,
     variance: float = 1e-10,
     prior: tuple[F64, F64] = NO_PRIOR,
+    depth: bool = False,
 ) -> tuple[F64, F64, F64]:
-    cameras = StereoCameras.of(rig(camera))
+    cameras = StereoCameras.of(rig(camera, depth))
     distance = np.linalg.norm(points, axis=1)
     n = len(points)
     pose, _, covariance, error = pose_solver.optimise_pose(
@@ -105,16 +106,24 @@ def test_the_left_image_alone_is_enough() -> None:
     assert np.abs(found - pose).max() < 1e-7
 
 
-def test_the_covariance_predicts_the_scatter() -> None:
-    """Squared Mahalanobis length of the error has mean six when pixels and distances are as noisy as stated."""
+@pytest.mark.parametrize("depth", [False, True])
+def test_the_covariance_predicts_the_scatter(depth: bool) -> None:
+    """Squared Mahalanobis length of the error has mean six when pixels and distances are as noisy as stated.
+
+    A depth camera's right pixels have the noise of the left ones and of the disparities.
+    """
     rng = np.random.default_rng(5)
     pose, points, uv, uv_right = scene(CAMERAS[0], 150, 4)
     lengths = []
     for _ in range(60):
-        noisy = uv + rng.normal(size=uv.shape) * 0.5, uv_right + rng.normal(size=uv.shape) * 0.5
-        found, covariance, _ = solve(CAMERAS[0], points, *noisy)
+        noise, noise_right = rng.normal(size=(2, *uv.shape)) * 0.5
+        if depth:
+            noise_right[:, 1] = 0.0
+            noise_right += noise
+        found, covariance, error = solve(CAMERAS[0], points, uv + noise, uv_right + noise_right, depth=depth)
         xi = se3.log(se3.inverse(pose) @ found)
         lengths.append(xi @ np.linalg.solve(covariance, xi))
+        assert np.sqrt(np.mean(np.square(error))) == pytest.approx(1.0, abs=0.15)
     assert 4.0 < np.mean(lengths) < 9.0
 
 

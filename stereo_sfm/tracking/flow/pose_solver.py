@@ -54,7 +54,7 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cameras, res, jac,
         res (4,), jac (4, 6), ray (4,): filled in; derivatives by odom_T_cam @ exp(xi) and by rho.
 
     Returns:
-        0 if the left pixel cannot be predicted, 2 with the left image only, 4 with both.
+        0 if the left pixel cannot be predicted, 2 with the left image only, 4 with both, 3 with a depth camera.
     """
     qx, qy, qz = px - pose[0, 3], py - pose[1, 3], pz - pose[2, 3]
     x = pose[0, 0] * qx + pose[1, 0] * qy + pose[2, 0] * qz
@@ -90,6 +90,12 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cameras, res, jac,
                 ray[2 + i] = ju * gx + jv * gy + jw * gz
                 jac[2 + i, 0], jac[2 + i, 1], jac[2 + i, 2] = -ju, -jv, -jw
                 jac[2 + i, 3], jac[2 + i, 4], jac[2 + i, 5] = jv * z - jw * y, jw * x - ju * z, ju * y - jv * x
+            if cameras.depth:
+                rows = 3
+                res[2] -= res[0]
+                ray[2] -= ray[0]
+                for i in range(6):
+                    jac[2, i] -= jac[0, i]
     return rows
 
 
@@ -143,10 +149,9 @@ def normal_equations(pose, velocity, points, rho, cameras, sigma, scale, normal,
         w = 1.0 / (1.0 + chi2 / (rows * scale * scale))
         wi = w * inv_s2
         used += w
-        if rows == 2:
-            for m in range(2, 4):
-                res[m] = ray[m] = 0.0
-                jac[m] = 0.0
+        for m in range(rows, 4):
+            res[m] = ray[m] = 0.0
+            jac[m] = 0.0
         r0, r1, r2, r3 = res[0], res[1], res[2], res[3]
         y0, y1, y2, y3 = ray[0], ray[1], ray[2], ray[3]
         for i in range(6):

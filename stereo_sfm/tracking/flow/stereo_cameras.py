@@ -21,6 +21,7 @@ class StereoCameras(NamedTuple):
     params_r: F64
     left_T_right: F64
     right_T_left: F64
+    depth: bool  # the right camera is virtual: only disparities are measured
 
     @staticmethod
     def of(rig: Rig) -> StereoCameras:
@@ -37,4 +38,4 @@ class StereoCameras(NamedTuple):
         left, right = rig.left, rig.right if rig.right is not None else rig.left
         right_T_left = np.ascontiguousarray(se3.inverse(rig.left_T_right))
         poses = np.ascontiguousarray(rig.left_T_right), right_T_left
-        return StereoCameras(left.model_id, left.params, right.model_id, right.params, *poses)
+        return StereoCameras(left.model_id, left.params, right.model_id, right.params, *poses, rig.depth)
