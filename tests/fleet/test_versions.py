@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -162,6 +163,69 @@ def test_robots_that_were_given_a_version_lose_it_when_it_is_rolled_back(place: 
     assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [1, 1, 1]
     publish_night(store, tmp_path / "made", 2)
     assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [3, 1, 3]
+
+
+def answer_lost(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], object]) -> None:
+    """The next exchange is carried out, its answer lost; something else happens before it is tried again."""
+    exchange = objects.exchange
+
+    def lost(remote: Remote, data: bytes, tag: str | None) -> None:
+        monkeypatch.setattr(objects, "exchange", exchange)
+        exchange(remote, data, tag)
+        meanwhile()
+        exchange(remote, data, tag)
+
+    monkeypatch.setattr(objects, "exchange", lost)
+
+
+def test_a_version_whose_answer_was_lost_is_the_parent_of_the_next(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Remote.of(place)
+    publish_night(store, tmp_path / "made", 0)
+    answer_lost(monkeypatch, lambda: publish_night(store, tmp_path / "other", 2))
+    publish_night(store, tmp_path / "made", 1)
+    assert [v.number for v in history(store)] == [3, 2, 1]
+    assert current(store).sessions.keys() == {"session0", "session1", "session2"}
+    fetch_version(store, numbered(store, 2), tmp_path / "robot")
+    assert content(tmp_path / "robot") == content(tmp_path / "made")
+    assert roll_back(store).number == 2
+
+
+def test_a_rollback_whose_answer_was_lost_is_not_done_twice(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Remote.of(place)
+    for night in (0, 1):
+        publish_night(store, tmp_path / "made", night)
+    answer_lost(monkeypatch, lambda: publish_night(store, tmp_path / "other", 2))
+    assert roll_back(store).number == 1 and [v.number for v in history(store)] == [3, 1]
+
+
+def test_a_rollback_that_is_killed_has_reached_the_robots(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after its first write."""
+    store, exchange = Remote.of(place), objects.exchange
+    for night in (0, 1):
+        publish_night(store, tmp_path / "made", night)
+    release(store, 1)
+    release(store, 2, ("r7",))
+
+    def killed(remote: Remote, data: bytes, tag: str | None) -> None:
+        exchange(remote, data, tag)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(objects, "exchange", killed)
+    with pytest.raises(KeyboardInterrupt):
+        roll_back(store)
+    monkeypatch.setattr(objects, "exchange", exchange)
+    assert current(store).number == released(store, "r7").number == 1
+    with pytest.raises(StereoSfmError, match=r"version 2 of .* was rolled back"):
+        release(store, 2, ("r8",))
+    publish_night(store, tmp_path / "made", 2)
+    release(store, 3, ("r8",))
+    assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [1, 1, 3]
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", ""])
