@@ -160,17 +160,18 @@ def fetched(remote: Remote) -> Path:
 def fetch_released(remote: Remote, robot: str, folder: Path) -> None:
     """Make a folder the version that a robot should have.
 
-    Where the network is away, or the version is damaged, a folder that has one already stays as it is.
+    Where the network is away, the version is damaged, or disk or memory are full, a folder that has one already stays
+    as it is.
 
     Raises:
-        StereoSfmError: it has none.
+        StereoSfmError, OSError, MemoryError: it has none.
     """
     kept = version_of(folder, remote)[1]
     try:
         with objects.patience(START_S if kept else objects.PATIENCE_S):
             found = fetch_version(remote, released(remote, robot), folder)
         log.info("%s is version %d of %s, %.2f MB fetched", folder, found.version, remote, found.received / 1e6)
-    except StereoSfmError as error:
+    except (StereoSfmError, OSError, MemoryError) as error:
         if not kept:
             raise
-        log.warning("%s: %s stays version %d", error, folder, kept)
+        log.warning("%s: %s stays version %d", str(error) or "too little memory", folder, kept)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import threading
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from stereo_sfm.arrays import write_arrays
 from stereo_sfm.errors import StereoSfmError
@@ -327,6 +329,26 @@ def test_without_a_network_a_robot_keeps_its_version(
     assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
     assert "stays version 1" in capsys.readouterr().err and content(tmp_path / "robot") == before
     assert main(["map", "fetch", place, str(tmp_path / "other")]) == StereoSfmError.exit_code
+
+
+@pytest.mark.parametrize("full", ["disk", "memory"])
+def test_without_room_a_robot_keeps_its_version(
+    full: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store, robot = Remote.of(place), tmp_path / "robot"
+    publish_night(store, tmp_path / "made", 0)
+    fetch_released(store, "", robot)
+    before = content(robot)
+    publish_night(store, tmp_path / "made", 1)
+
+    def no_room(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device") if full == "disk" else MemoryError
+
+    monkeypatch.setattr(*((Path, "write_bytes") if full == "disk" else (zstandard, "ZstdDecompressor")), no_room)
+    with pytest.raises(OSError if full == "disk" else MemoryError):  # nothing is damaged
+        fetch_released(store, "", tmp_path / "other")
+    fetch_released(store, "", robot)
+    assert "stays version 1" in caplog.text and content(robot) == before
 
 
 def test_without_a_network_a_map_is_read_as_it_was_fetched_last(
