@@ -184,7 +184,7 @@ def send_file(
     """Write one file; nobody sees it before it is whole.
 
     Raises:
-        StereoSfmError: what arrived has another size, or it cannot be written.
+        StereoSfmError: what arrived has another size, or it cannot be written. InterruptedError: `stopped` became true.
     """
     objects.write(remote, path if pace is None or not pace.bytes_s else pace.pieces(path, stopped))
     size = path.stat().st_size
