@@ -14,6 +14,7 @@ import pytest
 import zstandard
 
 from stereo_sfm.arrays import write_arrays
+from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet import copies
 from stereo_sfm.fleet.copies import fetch_released, fetch_version, version_of
@@ -30,6 +31,7 @@ from stereo_sfm.fleet.versions import (
     released,
     roll_back,
 )
+from stereo_sfm.maps.store import lock
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.objects import Changed, Unreachable
 from stereo_sfm.storage.remote import Remote
@@ -89,6 +91,38 @@ def test_a_folder_of_another_store_becomes_this_one(place: str, tmp_path: Path) 
     publish_night(store, tmp_path / "anew", 2)
     fetch_released(store, "", robot)
     assert content(robot) == content(tmp_path / "anew")
+
+
+def test_a_map_of_no_store_is_not_replaced(place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store, mine = Remote.of(place), tmp_path / "mine"
+    publish_night(store, tmp_path / "made", 0)
+    write_night(mine, 1)
+    before = content(mine)
+    assert main(["map", "fetch", place, str(mine)]) == StereoSfmError.exit_code
+    said = capsys.readouterr().err.strip()
+    assert "of another map: choose another folder" in said and len(said.splitlines()) == 1
+    with pytest.raises(StereoSfmError, match="of another map"):  # at the start of a service
+        fetch_released(store, "", mine)
+    assert content(mine) == before
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("stays")
+    assert main(["map", "fetch", place, str(tmp_path / "notes")]) == 0
+    assert content(tmp_path / "notes").keys() == {*content(tmp_path / "made"), "mine.txt"}
+
+
+def test_two_programs_write_no_map_at_once(place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A robot is given a map while a person fetches it."""
+    store, robot = Remote.of(place), tmp_path / "robot"
+    publish_night(store, tmp_path / "made", 0)
+    fetch_released(store, "", robot)
+    publish_night(store, tmp_path / "made", 1)
+    with lock(robot):
+        with pytest.raises(StereoSfmError, match="another run is writing to"):
+            fetch_version(store, current(store), robot)
+        fetch_released(store, "", robot)
+        assert "stays version 1" in caplog.text and version_of(robot)[1] == 1
+    fetch_released(store, "", robot)
+    assert version_of(robot)[1] == 2
 
 
 def test_a_second_writer_is_refused_and_writes_nothing(place: str, tmp_path: Path) -> None:
@@ -316,8 +350,6 @@ def test_a_store_of_before_has_one_folder_of_files(place: str, tmp_path: Path) -
 def test_without_a_network_a_robot_keeps_its_version(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from stereo_sfm.cli import main
-
     publish_night(Remote.of(place), tmp_path / "made", 0)
     assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
     before = content(tmp_path / "robot")
