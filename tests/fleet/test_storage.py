@@ -15,7 +15,7 @@ from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.recording.segments import Segment, new_recording
 from stereo_sfm.recording.upload import Uploader
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_file, send_folder
+from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_file, send_folder, sum_of
 from stereo_sfm.storage.objects import Missing, Unreachable
 from stereo_sfm.storage.remote import Remote, place
 from stereo_sfm.storage.stream import PAGE, RangeStream
@@ -184,6 +184,32 @@ def test_a_truncated_upload_is_found(place: str, tmp_path: Path) -> None:
         fetch(target)
     assert not [*(tmp_path / "cache").rglob("a")]
     assert SUMS in [name for name, _, _ in objects.listed(target)]
+
+
+def test_a_folder_sent_again_mends_a_truncated_upload(place: str, tmp_path: Path) -> None:
+    (tmp_path / "f").mkdir()
+    for name in ("a", "b", "c"):
+        (tmp_path / "f" / name).write_bytes(name.encode() * 1000)
+    target = Remote.of(place) / "f"
+    send_folder(tmp_path / "f", target)
+    objects.write(target / "a", b"a" * 500)
+    objects.delete([target / "b"])
+    assert send_folder(tmp_path / "f", target) == 2000 and send_folder(tmp_path / "f", target) == 0
+    assert (fetch(target) / "a").read_bytes() == b"a" * 1000
+
+
+def test_a_single_file_is_checked_as_well(place: str, tmp_path: Path) -> None:
+    (tmp_path / "here.mcap").write_bytes(b"1" * 1000)
+    target = Remote.of(place) / "there.mcap"
+    assert main(["fleet", "upload", str(tmp_path / "here.mcap"), str(target)]) == 0
+    assert objects.read(sum_of(target)).endswith(b"  there.mcap\n")  # the name that `sha256sum -c` finds
+    assert fetch(target).read_bytes() == b"1" * 1000
+    for damaged in (b"1" * 500, b"2" * 1000):
+        objects.write(target, damaged)
+        with pytest.raises(StereoSfmError, match=r"there\.mcap is not what was sent"):
+            fetch(target)
+    objects.delete([sum_of(target)])  # of another program
+    assert fetch(target).read_bytes() == b"2" * 1000
 
 
 def test_a_pace_is_kept(tmp_path: Path) -> None:
