@@ -17,10 +17,10 @@ from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import date, timedelta
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.errors import Hindered, StereoSfmError, require
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.storage.remote import Remote
 
@@ -47,7 +47,11 @@ class Changed(StereoSfmError):
     """Somebody else has written the object meanwhile."""
 
 
-class Unreachable(StereoSfmError):
+class Refused(Hindered):
+    """There is no bucket, no right, no room, or no credentials."""
+
+
+class Unreachable(Hindered):
     """The network or the server failed for longer than `PATIENCE_S`."""
 
 
@@ -121,20 +125,22 @@ def _named(remote: Remote, doing: str, error: BaseException, obx: Any) -> Stereo
     said = str(error).partition("\n\nDebug source")[0].replace(f"/{remote.key}", "")
     found = ANSWER.search(said)
     answer = found[0] if found else ""
+    if isinstance(error, obx.InvalidPathError):
+        return StereoSfmError(f"cannot {doing} {remote}: a name has an empty part or dots between slashes: rename it")
     if NO_BUCKET.search(answer):
-        return StereoSfmError(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
+        return Refused(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
     if isinstance(error, FileNotFoundError | obx.NotFoundError):
         return Missing(f"there is no {remote}")
     if FULL.search(answer):  # before the rights: some servers answer 403 to what exceeds a limit
-        return StereoSfmError(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
+        return Refused(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
     denied = (PermissionError, obx.PermissionDeniedError, obx.UnauthenticatedError)
     if isinstance(error, denied) or DENIED.search(answer):
-        return StereoSfmError(
+        return Refused(
             f"no right to {doing} {remote}: check the credentials in the environment, and the rights of this prefix"
         )
     if NO_CREDENTIALS.search(said):
         where = CREDENTIALS.get(remote.scheme, "")
-        return StereoSfmError(f"no credentials for {remote.scheme}://: set them in the environment ({where})")
+        return Refused(f"no credentials for {remote.scheme}://: set them in the environment ({where})")
     code = CODE.search(answer)
     why = (code[1] or code[2]) if code else "no answer"
     return Unreachable(f"cannot {doing} {remote}: {why}, although it was tried again and again")
@@ -266,7 +272,7 @@ def _exchange_file(remote: Remote, data: bytes, tag: str | None) -> None:
 
 
 def listed(remote: Remote) -> list[tuple[str, int, str]]:
-    """(name below it, bytes, tag) of every object in a folder, by name.
+    """(name below it, bytes, tag) of every object in a folder, by name; no empty ones that stand for a folder.
 
     Raises:
         StereoSfmError: there is no such bucket, or no right to list it.
@@ -274,8 +280,10 @@ def listed(remote: Remote) -> list[tuple[str, int, str]]:
     prefix = f"{remote.key}/" if remote.key else ""
     with _opened(remote, "list") as store:
         found = [m for page in store.list(prefix=prefix or None) for m in page]
-    rows = [(str(m["path"]).removeprefix(prefix), int(m["size"]), str(m["e_tag"])) for m in found]
-    return sorted(row for row in rows if row[0])
+    inside = [m for m in found if str(m["path"]).startswith(prefix)]
+    rows = [(str(m["path"])[len(prefix) :], int(m["size"]), str(m["e_tag"])) for m in inside]
+    above = {str(parent) for name, _, _ in rows for parent in PurePosixPath(name).parents}
+    return sorted(row for row in rows if row[1] or row[0] not in above)
 
 
 def folders(remote: Remote) -> list[str]:
