@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.config import Config, dump
-from stereo_sfm.errors import StereoSfmError, printable
+from stereo_sfm.errors import Hindered, StereoSfmError, printable
 from stereo_sfm.eval.statistics import failure
 from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.eval.tables import write_table
@@ -82,7 +82,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
             stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
         result |= {"ok": True, "stats": stats, "failure": failure(stats)}
     except StereoSfmError as error:
-        result |= {"ok": False, "error": str(error), "kind": type(error).__name__}
+        result |= {"ok": False, "error": str(error), "hindered": isinstance(error, Hindered)}
     except (TimeoutError, MemoryError):
         raise
     except Exception:
