@@ -9,8 +9,8 @@ An S3 server (moto's, with conditional puts that are atomic) answers a tenth of 
 after it has carried them out, and is stopped for 20 s. A Ray cluster of three nodes on this computer loses workers at
 random moments, and the driver is killed and started again each night. Each store gets the map of a session from a robot
 each night. The first store's robot is offline for all nights and sends everything at the end; the second one's sends
-everything twice; an upload of the third one is cut off and sent again; a version of the last one is rolled back. For
-each sentence it prints whether it holds.
+everything twice; an upload of the third one is cut off and sent again; a version of the last one is rolled back,
+then comes one more night. For each sentence it prints whether it holds.
 """
 
 from __future__ import annotations
