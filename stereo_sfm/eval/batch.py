@@ -107,12 +107,14 @@ def finished(task: BatchTask) -> dict[str, Any] | None:
     return result if same and has_map else None
 
 
-def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
+def run_batch(
+    tasks: Sequence[BatchTask], address: str | None = None, limits: Limits | None = None
+) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
     """Run what is not finished yet, on this machine or on a cluster; yields in the order of completion.
 
     Args:
         tasks: what to run; the folders must be reachable from every node.
-        address: of a Ray cluster, None for this machine.
+        address: of a Ray cluster, None for this machine. limits: of each recording.
     """
     waiting: list[BatchTask] = []
     for task in tasks:
@@ -125,7 +127,7 @@ def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterato
         return
     of = {task.folder: task for task in waiting}
     jobs = [Job(task.folder, run_one, (task,)) for task in waiting]
-    for job, result in run_jobs(jobs, Limits(), address, "batch"):
+    for job, result in run_jobs(jobs, limits or Limits(), address, "batch"):
         yield of[job.name], {"recording": of[job.name].spec, **result}
 
 

@@ -132,7 +132,10 @@ def walk_row(walk: Walk, result: Mapping[str, Any], why: str, session: str, cost
 
 
 def write_tables(place: Remote, night: str, tables: Mapping[str, Rows]) -> None:
-    """Write a night's files; tables without rows as well, so that nothing of an earlier try stays."""
+    """Write a night's files; tables without rows as well, so that nothing of an earlier try stays.
+
+    Rows of an earlier version of the program may lack columns.
+    """
     require(("pyarrow",), "fleet", "the catalogue")
     import pyarrow
     from pyarrow import parquet
@@ -143,7 +146,7 @@ def write_tables(place: Remote, night: str, tables: Mapping[str, Rows]) -> None:
     }  # fmt: skip
     for name, columns in TABLES.items():
         schema = pyarrow.schema([(column, types[kind]) for column, kind in columns.items()])
-        rows = [{column: _value(row[column]) for column in columns} for row in tables[name]]
+        rows = [{column: _value(row.get(column)) for column in columns} for row in tables[name]]
         buffer = io.BytesIO()
         parquet.write_table(pyarrow.Table.from_pylist(rows, schema), buffer)
         objects.write(place / f"{name}-{night}.parquet", buffer.getvalue())

@@ -60,7 +60,7 @@ def map_walk(root: Remote, walk: Walk, config: Config) -> Result:
     place = root / walk.store / "work" / walk.key
     by = hashlib.sha256(json.dumps([stereo_sfm.__version__, dump(config)]).encode()).hexdigest()[:16]
     done = read_json(place / RESULT)
-    if done is not None and (done["ok"] or done.get("by") == by):
+    if done is not None and (done.get("ok") or done.get("by") == by):
         return {**done, "resumed": True}
     objects.create(place / BEGUN, b"begun\n")  # keeps the day of the first try
     begin = processor_s()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 import urllib.parse
 from collections.abc import Callable
 from pathlib import Path
@@ -308,6 +309,18 @@ def test_a_row_has_all_terms_the_health_and_the_cost(
         ","
     )
     assert float(walk) > float(update) > 0  # all steps of the walk
+
+
+def test_rows_of_an_earlier_version_are_kept(plan: Plan, session: Path, others: list[Path]) -> None:
+    marker = plan.root / STORE / "catalogue" / f"{NIGHT}.json"
+    send_folder(session, walks(plan) / "r1" / f"{NIGHT}_2200")
+    carry_out(plan)
+    known = json.loads(objects.read(marker))
+    del known["rows"][f"r1/{NIGHT}_2200"]["health"]
+    objects.write(marker, json.dumps(known).encode())
+    send_folder(others[0], walks(plan) / "r2" / f"{NIGHT}_2300")
+    carry_out(plan)
+    assert rows(plan, "SELECT robot, version FROM walks ORDER BY robot") == ["r1,1", "r2,2"]
 
 
 STATS: dict[str, Any] = {
