@@ -86,12 +86,13 @@ def _forget_walks(plan: Plan, walks: list[Walk], today: datetime.date) -> int:
     for night, found in groupby(old, key=lambda walk: walk.night):
         known = Night.read(plan.root, old[0].store, night)
         for walk in found:
-            if not known.is_settled(walk):
-                begun = plan.root / walk.store / "work" / walk.key / BEGUN
-                if not objects.exists(begun) or (today - objects.written(begun)).days <= days:
-                    continue
-                known.give_up(walk, days)
+            begun = plan.root / walk.store / "work" / walk.key / BEGUN
+            settled = known.is_settled(walk)
+            if not settled and (not objects.exists(begun) or (today - objects.written(begun)).days <= days):
+                continue
             deleted += _delete(place[walk])
+            if not settled:  # said afterwards: a store whose tables cannot be written keeps no images of people
+                known.give_up(walk, days)
     return deleted
 
 

@@ -133,6 +133,16 @@ def test_images_go_by_their_own_walk(plan: Plan, session: Path, monkeypatch: pyt
     assert why == ["True,1,", "False,,it took more than 60 minutes; its recording was deleted after 30 days"]
 
 
+def test_a_store_that_cannot_be_written_keeps_no_images(plan: Plan, session: Path) -> None:
+    """Its map is damaged, so that none of its nights ends."""
+    send_folder(session, walks(plan) / "r1" / f"{OLD}_2200")
+    objects.write(plan.root / STORE / "map" / "head.json", b"no head")
+    assert "damaged" in carry_out(plan, kept=True)[f"{STORE} {OLD}"]["error"]
+    with pytest.raises(StereoSfmError, match="damaged"):
+        forget_images(plan, find_walks(plan)[0], TODAY + datetime.timedelta(40))
+    assert find_walks(plan) == ([], [])
+
+
 def test_what_is_sent_again_is_mapped_before_it_is_deleted(
     plan: Plan, session: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
