@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import random
 import subprocess
@@ -18,6 +19,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.fleet.catalogue import ask, delta_bytes, opened
 from stereo_sfm.fleet.copies import fetch_version
 from stereo_sfm.fleet.editing import checked_out, session_id
+from stereo_sfm.fleet.plan import load_plan
 from stereo_sfm.fleet.versions import Version, current, history, publish, read_head, roll_back
 from stereo_sfm.maps.put_session import put_session
 from stereo_sfm.maps.saved_map import load_map, save_map
@@ -25,6 +27,7 @@ from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import send_folder
 from stereo_sfm.storage.objects import Changed
 from stereo_sfm.storage.remote import Remote
+from tests.fleet.nights import carry_out
 from tests.fleet.s3_server import BUCKET, Server
 from tests.loop.store_sequence import make_sequence
 from tests.maps.maps import map_of_sequence, same
@@ -159,7 +162,7 @@ def nights(
     verdicts: Verdicts, s3: Server, folder: Path, stores: int, count: int, kills: int, pause_s: float, seed: int
 ) -> None:
     """All nights of all stores under faults, then the sentences."""
-    sessions = make_sessions(folder, count)
+    *sessions, later = make_sessions(folder, count + 1)
     for session in sessions:
         put_session(folder / "hand", load_map(session), session.name, Config(), compress=False)
     chain, plan, chance = Chain(stores, sessions), folder / "plan.toml", random.Random(seed)
@@ -205,6 +208,7 @@ def nights(
     verdicts.row("a cut-off upload stops no other walk", cut[0] == 3 and cut[1].endswith(", 2 failed"), _jobs(cut[1]))
     verdicts.row("one more run does nothing", again[0] == 0 and " 0 of " in again[1], _jobs(again[1]))
     check(verdicts, chain, folder)
+    roll_back_and_go_on(verdicts, chain, folder, later)
 
 
 def _jobs(text: str) -> str:
@@ -233,8 +237,25 @@ def check(verdicts: Verdicts, chain: Chain, folder: Path) -> None:
     most = max(delta_bytes(new, old) for new, old in itertools.pairwise(versions))
     whole = sum(f.stored for f in versions[0].files.values())
     print(f"# a night's difference of a tiny store: {most / 1e6:.3f} of {whole / 1e6:.3f} MB", file=sys.stderr)
-    rolled = roll_back(chain.root / names[-1] / "map")
+
+
+def roll_back_and_go_on(verdicts: Verdicts, chain: Chain, folder: Path, later: Path) -> None:
+    """The last store's last version is rolled back, then comes one more night with the session `later`."""
+    name, count = chain.names[-1], len(chain.sessions)
+    place, versions = chain.root / name / "map", history(chain.root / name / "map")
+    rolled = roll_back(place)
     verdicts.row("a version rolled back", rolled.name == versions[1].name, f"version {rolled.number} again")
+    send_folder(later, chain.root / name / "walks" / "r1" / f"{night_of(count)}_2200")
+    plan = load_plan(folder / "plan.toml")
+    carry_out(dataclasses.replace(plan, fleet=dataclasses.replace(plan.fleet, stores=name)))
+    for session in (*chain.sessions[:-1], later):
+        put_session(folder / "hand_later", load_map(session), session.name, Config(), compress=False)
+    version, hand = current(place), load_map(folder / "hand_later")
+    equal = version.parent == rolled.name and _as_by_hand(chain, name, version, folder, hand)
+    with opened(chain.root, [name]) as connection:
+        (rows,) = ask(connection, "SELECT string_agg(coalesce(version, 0), ' ' ORDER BY night) FROM walks")[1:]
+    wanted = " ".join(str(v.number) for v in versions[:0:-1]) + f" 0 {version.number}"
+    verdicts.row("what was rolled back stays out the next night", equal and rows == wanted, f"versions {rows}")
 
 
 def _as_by_hand(chain: Chain, store: str, version: Version, folder: Path, hand: Any) -> bool:

@@ -9,8 +9,8 @@ An S3 server (moto's, with conditional puts that are atomic) answers a tenth of 
 after it has carried them out, and is stopped for 20 s. A Ray cluster of three nodes on this computer loses workers at
 random moments, and the driver is killed and started again each night. Each store gets the map of a session from a robot
 each night. The first store's robot is offline for all nights and sends everything at the end; the second one's sends
-everything twice; an upload of the third one is cut off and sent again; a version of the last one is rolled back. For
-each sentence it prints whether it holds.
+everything twice; an upload of the third one is cut off and sent again; a version of the last one is rolled back,
+then comes one more night. For each sentence it prints whether it holds.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--stores", type=int, default=200, help="at least 3")
     parser.add_argument("--nights", type=int, default=3)
     parser.add_argument("--kills", type=int, default=30, help="workers killed")
-    parser.add_argument("--pause", type=float, default=25.0, help="mean seconds between two kills")
+    parser.add_argument("--pause", type=float, default=15.0, help="mean seconds between two kills")
     parser.add_argument("--megabytes", type=int, default=10_000, help="on the disk, of the recording for info")
     parser.add_argument("--keep", type=Path, help="file of the rows of parts that ended")
     parser.add_argument("--write", action="store_true", help="replace the benchmark's figures")

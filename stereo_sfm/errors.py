@@ -24,6 +24,10 @@ class StereoSfmError(Exception):
     stage = ""  # of a pipeline in processes, which failed with it
 
 
+class Hindered(StereoSfmError):
+    """Nothing is wrong with the input: no room, no right or no network, here and now. It may do another time."""
+
+
 def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[StereoSfmError] = StereoSfmError) -> None:
     """Check that the libraries of one of the package's extras are installed.
 
@@ -35,16 +39,16 @@ def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[Ster
         raise error(f"{purpose} needs {', '.join(missing)}: pip install 'stereo-sfm[{extra}]'")
 
 
-def from_os_error(error: OSError) -> StereoSfmError | None:
+def from_os_error(error: OSError) -> Hindered | None:
     """A one-line error for a problem with a file; None for others (a pipe between processes)."""
     kept = "what was written so far is kept"
     if error.filename is None:
-        return StereoSfmError(f"cannot write: {error.strerror}; {kept}") if error.errno in _DISK_ERRORS else None
+        return Hindered(f"cannot write: {error.strerror}; {kept}") if error.errno in _DISK_ERRORS else None
     if error.errno in _FULL:
-        return StereoSfmError(f"cannot write to {error.filename}: {error.strerror}; {kept}")
+        return Hindered(f"cannot write to {error.filename}: {error.strerror}; {kept}")
     if isinstance(error, FileExistsError):
-        return StereoSfmError(f"{error.filename}: a file with this name exists already")
-    return StereoSfmError(f"{error.filename}: {error.strerror}")
+        return Hindered(f"{error.filename}: a file with this name exists already")
+    return Hindered(f"{error.filename}: {error.strerror}")
 
 
 def printable(text: str) -> str:

@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError, printable, require
@@ -75,14 +76,13 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
             options["memory"] = int(limits.memory_gb * 1e9)
             _check_memory(ray.nodes(), options["memory"])
         remote = ray.remote(**options)(_within)
-        waiting, results = list(jobs), dict[str, Result]()
+        order, of = TopologicalSorter({job.name: job.after for job in jobs}), {job.name: job for job in jobs}
+        order.prepare()
+        results: dict[str, Result] = {}
         pending: dict[Any, Job] = {}
         try:
-            while waiting or pending:
-                ready = [job for job in waiting if all(name in results for name in job.after)]
-                chosen = {job.name for job in ready}
-                waiting = [job for job in waiting if job.name not in chosen]
-                for job in ready:
+            while order.is_active():
+                for job in map(of.__getitem__, order.get_ready()):
                     before = {name: results[name] for name in job.after}
                     pending[remote.remote(job.work, job.args, before, limits)] = job
                 done, _ = ray.wait(list(pending), num_returns=1)
@@ -93,6 +93,7 @@ def run_jobs(jobs: Sequence[Job], limits: Limits, address: str | None, extra: st
                     except RayError as error:
                         result = {"ok": False, "error": f"the task died: {_why(error)}"}
                     results[job.name] = result
+                    order.done(job.name)
                     yield job, result
         finally:
             for reference in pending:

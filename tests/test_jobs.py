@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import signal
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from stereo_sfm import jobs as jobs_module
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.jobs import Job, Limits, _within, run_jobs  # pyright: ignore[reportPrivateUsage]
 
@@ -46,6 +51,49 @@ def dies(counter: Path, times: int) -> dict[str, Any]:
     if len(counter.read_text()) <= times:
         os.kill(os.getpid(), signal.SIGKILL)
     return {"ok": True, "tries": len(counter.read_text())}
+
+
+class Counted(tuple[str, ...]):
+    """What a job waits for, which counts how often it is looked at."""
+
+    looks = 0
+
+    def __iter__(self) -> Iterator[str]:
+        Counted.looks += 1
+        return super().__iter__()
+
+
+class AtOnce:
+    """In place of Ray: a job is done where it is given."""
+
+    def remote(self, **_: Any) -> Callable[..., Any]:
+        return lambda work: SimpleNamespace(remote=lambda *args: Done(work(*args)))
+
+    def wait(self, pending: list[Done], num_returns: int) -> tuple[list[Done], list[Done]]:
+        return pending[-num_returns:], pending[:-num_returns]
+
+    def get(self, done: Done) -> dict[str, Any]:
+        return done.result
+
+
+@dataclass(eq=False)
+class Done:
+    result: dict[str, Any]
+
+
+def test_a_long_plan_is_looked_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each job's conditions are read a few times, however many others there are; results go to whoever waits."""
+    pytest.importorskip("ray")
+    monkeypatch.setattr(jobs_module, "_ray", lambda _: contextlib.nullcontext(AtOnce()))
+    count = 300
+    walks = [Job(f"walk {k}", work, ("walk",)) for k in range(count)]
+    nights = [
+        Job(f"night {k}", work, ("night",), Counted([f"walk {k}", *([f"night {k - 1}"] if k else [])]))
+        for k in range(count)
+    ]
+    order = [job.name for job, _ in run_jobs(walks + nights, Limits(), None, "fleet")]
+    assert len(order) == 2 * count and Counted.looks <= 3 * count
+    assert all(order.index(name) < order.index(job.name) for job in nights for name in job.after)
 
 
 @pytest.mark.slow

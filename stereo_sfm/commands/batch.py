@@ -27,6 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, required=True, help="folder for all results; an existing batch is continued"
     )
     parser.add_argument("--address", help="address of a Ray cluster (default: this machine)")
+    parser.add_argument("--memory-gb", type=float, default=0.0, metavar="N", help="most memory of a run (default: any)")
+    parser.add_argument("--minutes", type=float, default=0.0, metavar="N", help="longest time of a run (default: any)")
     parser.add_argument("--no-merge", action="store_true", help="do not merge the maps of the recordings")
     add_config_arguments(parser)
 
@@ -35,8 +37,10 @@ def run(args: argparse.Namespace) -> int:
     """Run all, write the table, merge the maps. A failed recording does not stop the others."""
     from stereo_sfm.commands._options import load_config
     from stereo_sfm.eval import batch
+    from stereo_sfm.jobs import Limits
 
     config = load_config(args)
+    limits = Limits(memory_gb=args.memory_gb, minutes=args.minutes)
     recordings = _expand(args.recordings)
     args.output.mkdir(parents=True, exist_ok=True)
     names = batch.names(recordings)
@@ -46,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         batch.BatchTask(spec, str(folder), config, merging) for spec, folder in zip(recordings, folders, strict=True)
     ]
     results = {}
-    for task, result in on_cluster(batch.run_batch(tasks, args.address), args.address):
+    for task, result in on_cluster(batch.run_batch(tasks, args.address, limits), args.address):
         results[task.folder] = result
         state = "failed" if batch.why_failed(result) else "ok"
         again = ", from before" if result.get("resumed") else ""

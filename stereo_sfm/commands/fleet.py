@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     report = actions.add_parser("report", help="print how stores and robots are, and write a page")
     report.add_argument("plan", type=Path, metavar="PLAN.toml", help="as of 'run'")
     report.add_argument("-o", "--output", type=Path, default=Path("fleet"), metavar="DIR", help="folder of the page")
-    report.add_argument("--sql", metavar="QUERY", help="ask the tables walks, versions and changes; no page")
+    report.add_argument("--sql", metavar="QUERY", help="ask the tables walks, sessions, versions and changes; no page")
     upload = actions.add_parser("upload", help="send a recording, or the recordings of a service's folder, to a bucket")
     upload.add_argument("path", type=Path, metavar="PATH", help="a file, or a folder of recordings")
     upload.add_argument("to", metavar="ADDRESS", help="of the object, or of the folder that recordings go to")
@@ -56,7 +56,7 @@ def _run(plan: Plan, address: str | None) -> int:
 
     walks, waiting = find_walks(plan)
     for place in waiting:
-        print(f"not complete yet: {place}", file=sys.stderr)
+        print(f"no whole walk: {place}", file=sys.stderr)
     failed = again = count = 0
     for count, (job, result) in enumerate(on_cluster(run_plan(plan, address, walks), address) if walks else (), 1):
         why = [] if result["ok"] else [result["error"].strip().splitlines()[-1]]
@@ -68,7 +68,7 @@ def _run(plan: Plan, address: str | None) -> int:
             print(f"{count} {job.name}: {'; '.join(why) or 'ok'}{version}", file=sys.stderr)
     deleted = forget_images(plan, walks, datetime.date.today(), waiting)
     stores = sorted({walk.store for walk in walks})
-    forgotten = forget_versions(plan, stores)
+    forgotten = forget_versions(plan, sorted({walk.store for walk in walks if walk.name}))
     nights = len({(walk.store, walk.night) for walk in walks})
     print(
         f"{len(walks)} walks in {nights} nights of {len(stores)} stores:"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.config import Config, dump
-from stereo_sfm.errors import StereoSfmError, printable
+from stereo_sfm.errors import Hindered, StereoSfmError, printable
 from stereo_sfm.eval.statistics import failure
 from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.eval.tables import write_table
@@ -82,7 +82,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
             stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
         result |= {"ok": True, "stats": stats, "failure": failure(stats)}
     except StereoSfmError as error:
-        result |= {"ok": False, "error": str(error), "kind": type(error).__name__}
+        result |= {"ok": False, "error": str(error), "hindered": isinstance(error, Hindered)}
     except (TimeoutError, MemoryError):
         raise
     except Exception:
@@ -107,12 +107,14 @@ def finished(task: BatchTask) -> dict[str, Any] | None:
     return result if same and has_map else None
 
 
-def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
+def run_batch(
+    tasks: Sequence[BatchTask], address: str | None = None, limits: Limits | None = None
+) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
     """Run what is not finished yet, on this machine or on a cluster; yields in the order of completion.
 
     Args:
         tasks: what to run; the folders must be reachable from every node.
-        address: of a Ray cluster, None for this machine.
+        address: of a Ray cluster, None for this machine. limits: of each recording.
     """
     waiting: list[BatchTask] = []
     for task in tasks:
@@ -125,7 +127,7 @@ def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterato
         return
     of = {task.folder: task for task in waiting}
     jobs = [Job(task.folder, run_one, (task,)) for task in waiting]
-    for job, result in run_jobs(jobs, Limits(), address, "batch"):
+    for job, result in run_jobs(jobs, limits or Limits(), address, "batch"):
         yield of[job.name], {"recording": of[job.name].spec, **result}
 
 

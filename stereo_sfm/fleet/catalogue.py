@@ -1,6 +1,9 @@
-"""The catalogue: a row for each walk, version of a map and change, as Parquet; DuckDB answers questions about it.
+"""The catalogue: a row for each walk, session, version of a map and change, as Parquet; DuckDB answers questions.
 
-    ROOT/STORE/catalogue/walks-2026-11-25.parquet, versions-..., changes-...
+    ROOT/STORE/catalogue/walks-2026-11-25.parquet, sessions-..., versions-..., changes-...
+
+A walk that was sent twice is one session. Costs are seconds of processor time: that of a walk is for all its steps,
+with its part of the update; that of a version is the update's alone.
 
 A night's files are written as a whole, so that writing them again doubles nothing.
 """
@@ -9,28 +12,34 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import tempfile
 from collections.abc import Generator, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import stereo_sfm
 from stereo_sfm.calib.choice import SCALES
 from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.fleet.editing import ROLLED_BACK
 from stereo_sfm.fleet.plan import Walk
-from stereo_sfm.fleet.versions import Version
+from stereo_sfm.fleet.versions import Version, read_head
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import fetch_file
 from stereo_sfm.storage.remote import Remote
 
+# The terms of `calib.choice`, in its order and units.
+TERMS = (
+    "turned_x_deg", "turned_y_deg", "turned_z_deg", "baseline_y_deg", "baseline_z_deg", "focal_percent",
+    "decentred_x_deg", "decentred_y_deg",
+)  # fmt: skip
 # column -> type of DuckDB and of pyarrow ("VARCHAR", "BIGINT", "DOUBLE", "BOOLEAN")
 WALKS = {
     "store": "VARCHAR", "night": "VARCHAR", "robot": "VARCHAR", "walk": "VARCHAR", "ok": "BOOLEAN", "why": "VARCHAR",
-    "session": "VARCHAR", "version": "BIGINT", "camera": "VARCHAR", "turned_x_deg": "DOUBLE",
-    "turned_y_deg": "DOUBLE", "turned_z_deg": "DOUBLE", "focal_percent": "DOUBLE", "keyframes": "BIGINT",
+    "session": "VARCHAR", "version": "BIGINT", "health": "VARCHAR", "camera": "VARCHAR",
+    **dict.fromkeys(TERMS, "DOUBLE"), "keyframes": "BIGINT",
     "frames": "BIGINT", "seconds": "DOUBLE", "path_m": "DOUBLE", "lost_percent": "DOUBLE", "losses": "BIGINT",
     "loops": "BIGINT", "drift_percent": "DOUBLE", "result": "VARCHAR", "software": "VARCHAR", "cost_s": "DOUBLE",
     "bytes": "BIGINT",
@@ -41,33 +50,50 @@ VERSIONS = {
     "software": "VARCHAR", "cost_s": "DOUBLE",
 }  # fmt: skip
 CHANGES = {"store": "VARCHAR", "night": "VARCHAR", "version": "BIGINT", "text": "VARCHAR"}
-TABLES = {"walks": WALKS, "versions": VERSIONS, "changes": CHANGES}
+SESSIONS = {
+    "store": "VARCHAR", "night": "VARCHAR", "session": "VARCHAR", "version": "BIGINT", "walk": "VARCHAR",
+    "robot": "VARCHAR", "camera": "VARCHAR", "keyframes": "BIGINT", "software": "VARCHAR",
+}  # fmt: skip
+TABLES = {"walks": WALKS, "sessions": SESSIONS, "versions": VERSIONS, "changes": CHANGES}
 NOTHING = "no shelf changed"
+AT_ONCE = 16  # files of a catalogue that are fetched
+_TABLE = re.compile(rf"(?:{'|'.join(TABLES)})-[^/]*\.parquet")
 
 Rows = list[dict[str, Any]]
 
 
-def night_tables(store: str, night: str, walks: Rows, versions: Sequence[Version], cost_s: float) -> dict[str, Rows]:
+def night_tables(
+    store: str, night: str, walks: Rows, versions: Sequence[Version], costs: Mapping[str, float]
+) -> dict[str, Rows]:
     """The rows of a night by table.
 
     Args:
         store, night. walks: its rows of `walk_row`, which get the number of their version.
-        versions: of the store, newest first. cost_s: seconds of the update.
+        versions: of the store, newest first. costs: processor time of the updates, by the number of their version.
     """
     by_name = {v.name: v for v in versions}
     added = {v.name: v.sessions.keys() - (by_name[v.parent].sessions.keys() if v.parent else ()) for v in versions}
     number = {session: v.number for v in versions for session in added[v.name]}
     walks = [{**row, "version": number.get(row["session"])} for row in walks]
-    mine = {row["session"] for row in walks}
-    made = [v for v in versions if added[v.name] & mine]
+    by_session = {row["session"]: row for row in walks[::-1]}
+    put = {v.name: [s for s in added[v.name] if v.sessions[s].startswith(f"{night} ")] for v in versions}
+    made = [v for v in versions if put[v.name]]
     return {
         "walks": walks,
+        "sessions": [
+            {
+                "store": store, "night": night, "session": session, "version": v.number,
+                **{name: by_session.get(session, {}).get(name) for name in list(SESSIONS)[4:]},
+            }
+            for v in made for session in sorted(put[v.name])
+        ],
         "versions": [
             {
                 "store": store, "night": night, "version": v.number, "parent": v.parent, "sessions": len(v.sessions),
                 "added": len(added[v.name]), "bytes": sum(f.bytes for f in v.files.values()),
                 "stored": sum(f.stored for f in v.files.values()), "delta": delta_bytes(v, by_name.get(v.parent)),
-                "changes": sum(text != NOTHING for text in v.changes), "software": v.software, "cost_s": cost_s,
+                "changes": sum(text != NOTHING for text in v.changes), "software": v.software,
+                "cost_s": costs.get(str(v.number)),
             }
             for v in made
         ],
@@ -84,28 +110,32 @@ def delta_bytes(version: Version, parent: Version | None) -> int:
     return sum(f.patched or f.stored for f in version.files.values() if f.sha256 not in known)
 
 
-def walk_row(walk: Walk, result: Mapping[str, Any], why: str, session: str) -> dict[str, Any]:
+def walk_row(walk: Walk, result: Mapping[str, Any], why: str, session: str, cost_s: float = 0.0) -> dict[str, Any]:
     """A walk in the catalogue.
 
-    Args: walk. result: of `steps.map_walk`. why: it is not in the map, "" if it is. session: checksum of its map.
+    Args:
+        walk. result: of `steps.map_walk`. why: it is not in the map, "" if it is. session: checksum of its map.
+        cost_s: processor time of putting it into the map.
     """
     stats = result.get("stats") or {}
     terms = (SCALES * np.array(result.get("terms") or [np.nan] * len(SCALES))).tolist()
     row = {
         "store": walk.store, "night": walk.night, "robot": walk.robot, "walk": walk.name, "ok": not why, "why": why,
-        "session": session, "version": None, "camera": result.get("camera"), "turned_x_deg": terms[0],
-        "turned_y_deg": terms[1], "turned_z_deg": terms[2], "focal_percent": terms[5],
-        "keyframes": result.get("keyframes"), "frames": stats.get("frames"), "seconds": stats.get("duration_s"),
-        "path_m": stats.get("path_m"), "lost_percent": stats.get("lost_percent"),
+        "session": session, "version": None, "health": result.get("health"), "camera": result.get("camera"),
+        **dict(zip(TERMS, terms, strict=True)), "keyframes": result.get("keyframes"), "frames": stats.get("frames"),
+        "seconds": stats.get("duration_s"), "path_m": stats.get("path_m"), "lost_percent": stats.get("lost_percent"),
         "losses": len(stats["lost_intervals"]) if stats else None, "loops": stats.get("loops_accepted"),
         "drift_percent": stats.get("closure_drift_percent_median"), "result": stats.get("fingerprint"),
-        "software": f"stereo-sfm {stereo_sfm.__version__}", "cost_s": result.get("cost_s"), "bytes": walk.bytes,
+        "software": result.get("software"), "cost_s": (result.get("cost_s") or 0.0) + cost_s, "bytes": walk.bytes,
     }  # fmt: skip
     return {name: _value(value) for name, value in row.items()}
 
 
 def write_tables(place: Remote, night: str, tables: Mapping[str, Rows]) -> None:
-    """Write a night's files; tables without rows as well, so that nothing of an earlier try stays."""
+    """Write a night's files; tables without rows as well, so that nothing of an earlier try stays.
+
+    Rows of an earlier version of the program may lack columns.
+    """
     require(("pyarrow",), "fleet", "the catalogue")
     import pyarrow
     from pyarrow import parquet
@@ -116,7 +146,7 @@ def write_tables(place: Remote, night: str, tables: Mapping[str, Rows]) -> None:
     }  # fmt: skip
     for name, columns in TABLES.items():
         schema = pyarrow.schema([(column, types[kind]) for column, kind in columns.items()])
-        rows = [{column: _value(row[column]) for column in columns} for row in tables[name]]
+        rows = [{column: _value(row.get(column)) for column in columns} for row in tables[name]]
         buffer = io.BytesIO()
         parquet.write_table(pyarrow.Table.from_pylist(rows, schema), buffer)
         objects.write(place / f"{name}-{night}.parquet", buffer.getvalue())
@@ -129,7 +159,7 @@ def _value(value: Any) -> Any:
 
 @contextmanager
 def opened(root: Remote, stores: Iterable[str]) -> Generator[Any]:
-    """A DuckDB connection with the tables `walks`, `versions` and `changes` of these stores.
+    """A DuckDB connection with the tables of these stores. What was rolled back since is in no version there.
 
     Raises:
         StereoSfmError: there is no catalogue yet.
@@ -138,26 +168,43 @@ def opened(root: Remote, stores: Iterable[str]) -> Generator[Any]:
     import duckdb
 
     with tempfile.TemporaryDirectory(prefix="catalogue") as folder:
-        found: dict[str, list[str]] = {name: [] for name in TABLES}
+        refused: list[tuple[str, str]] = []
+        paths: dict[Path, Remote] = {}
         for store in stores:
-            for name, size, _ in objects.listed(root / store / "catalogue"):
-                table = name.partition("-")[0]
-                if name.endswith(".parquet") and table in found and "/" not in name:
-                    path = Path(folder) / store / name
-                    fetch_file(root / store / "catalogue" / name, path, size)
-                    found[table].append(str(path))
-        if not found["walks"]:
+            place = root / store / "catalogue"
+            names = [name for name, _, _ in objects.listed(place) if _TABLE.fullmatch(name)]
+            if names:
+                (Path(folder) / store).mkdir()
+                paths |= {Path(folder) / store / name: place / name for name in names}
+                refused += [(store, session) for session in read_head(root / store / "map").refused]
+        if not paths:
             raise StereoSfmError(f"there is no catalogue at {root}: 'stereo-sfm fleet run PLAN.toml' makes one")
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            list(pool.map(lambda path: path.write_bytes(objects.read(paths[path])), paths))
         with duckdb.connect() as connection:
             for table, columns in TABLES.items():
                 names = ", ".join(f"{name} {kind}" for name, kind in columns.items())
                 connection.execute(f"CREATE TABLE {table} ({names})")
-                if found[table]:
+                found = [str(path) for path in paths if path.name.startswith(f"{table}-")]
+                if found:
                     # Tables of other versions may have fewer columns, or more.
-                    rows = connection.read_parquet(found[table], union_by_name=True)
+                    rows = connection.read_parquet(found, union_by_name=True)
                     known = ", ".join(name for name in columns if name in rows.columns)
                     connection.execute(f"INSERT INTO {table} BY NAME SELECT {known} FROM rows")
+            _follow_heads(connection, refused)
             yield connection
+
+
+def _follow_heads(connection: Any, refused: list[tuple[str, str]]) -> None:
+    """Take what was rolled back out of the tables. Args: refused, (store, session)."""
+    connection.execute("CREATE TEMP TABLE refused (store VARCHAR, session VARCHAR)")
+    if refused:
+        connection.executemany("INSERT INTO refused VALUES (?, ?)", refused)
+    out = "(store, session) IN (SELECT (store, session) FROM refused)"
+    for table in ("versions", "changes", "sessions"):
+        lost = f"SELECT (store, version) FROM walks WHERE {out} AND version IS NOT NULL"
+        connection.execute(f"DELETE FROM {table} WHERE (store, version) IN ({lost})")
+    connection.execute(f"UPDATE walks SET ok = false, why = ?, version = NULL WHERE {out}", [ROLLED_BACK])
 
 
 def ask(connection: Any, query: str) -> list[str]:

@@ -20,6 +20,7 @@ from stereo_sfm.fleet.versions import HEAD, StoredFile, Version, read_file, read
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.input_file import read_bytes, read_json
 from stereo_sfm.maps.replace_folder import recover, replaced_folder
+from stereo_sfm.maps.store import lock
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import cache_root, fetch, sha256
 from stereo_sfm.storage.remote import Remote
@@ -54,12 +55,21 @@ def fetch_version(store: Remote, version: Version, folder: Path) -> Fetched:
     """Make a folder this version of a store. Files that are not of the store's versions stay.
 
     Raises:
-        StereoSfmError: a file is damaged in the bucket, or cannot be fetched; the folder is as it was.
+        StereoSfmError: a file is damaged in the bucket, or cannot be fetched; the folder has a map that is of no store
+            in a bucket; or another program writes it. The folder is as it was.
     """
     folder = folder.absolute()
+    with lock(folder):
+        return _fetch_version(store, version, folder)
+
+
+def _fetch_version(store: Remote, version: Version, folder: Path) -> Fetched:
     recover(folder)
     name, before = version_of(folder, store)
     mine = {p.name: sha256(p) for p in folder.iterdir() if p.is_file()} if folder.is_dir() else {}
+    own = sorted(version.files.keys() & mine.keys())
+    if own and STATE not in mine:
+        raise StereoSfmError(f"{folder} has {own[0]} of another map: choose another folder, or move that map away")
     if name == version.name and all(mine.get(n) == f.sha256 for n, f in version.files.items()):
         return Fetched(version.number, before, 0)
     known: Set[str] = frozenset()
@@ -160,17 +170,18 @@ def fetched(remote: Remote) -> Path:
 def fetch_released(remote: Remote, robot: str, folder: Path) -> None:
     """Make a folder the version that a robot should have.
 
-    Where the network is away, or the version is damaged, a folder that has one already stays as it is.
+    Where the network is away, the version is damaged, or disk or memory are full, a folder that has one already stays
+    as it is.
 
     Raises:
-        StereoSfmError: it has none.
+        StereoSfmError, OSError, MemoryError: it has none.
     """
     kept = version_of(folder, remote)[1]
     try:
         with objects.patience(START_S if kept else objects.PATIENCE_S):
             found = fetch_version(remote, released(remote, robot), folder)
         log.info("%s is version %d of %s, %.2f MB fetched", folder, found.version, remote, found.received / 1e6)
-    except StereoSfmError as error:
+    except (StereoSfmError, OSError, MemoryError) as error:
         if not kept:
             raise
-        log.warning("%s: %s stays version %d", error, folder, kept)
+        log.warning("%s: %s stays version %d", str(error) or "too little memory", folder, kept)

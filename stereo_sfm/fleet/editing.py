@@ -19,6 +19,8 @@ from stereo_sfm.maps.columns import COLUMNS
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.storage.remote import Remote
 
+ROLLED_BACK = "its version was rolled back"
+
 
 def session_id(session: SavedMap) -> str:
     """A checksum of a session's own map: equal for equal maps, however they were saved or called."""
@@ -28,6 +30,13 @@ def session_id(session: SavedMap) -> str:
         digest.update(f"{name}{column.dtype}{column.shape}".encode())
         digest.update(np.ascontiguousarray(column).tobytes())
     return digest.hexdigest()[:32]
+
+
+def holds(head: Head, version: Version | None, session: str) -> str:
+    """Why a store with this head and its version does not take a session, "" if it does."""
+    if version is not None and session in version.sessions:
+        return "it is in the map already"
+    return ROLLED_BACK if session in head.refused else ""
 
 
 @dataclass
@@ -41,9 +50,7 @@ class Checkout:
 
     def holds(self, session: str) -> str:
         """Why a session is not put in, "" if it is to be."""
-        if self.version is not None and session in self.version.sessions:
-            return "it is in the map already"
-        return "its version was rolled back" if session in self.head.refused else ""
+        return holds(self.head, self.version, session)
 
     def publish(self, sessions: Mapping[str, str], changes: list[str]) -> Version:
         """Make the folder the next version. Raises Changed if another program was faster."""

@@ -25,6 +25,9 @@ def expanded(data: bytes, size: int, old: bytes | None = None) -> bytes | None:
 
     Args:
         data: of the object. size: of the file, the most that is taken. old: the earlier file, of a patch.
+
+    Raises:
+        MemoryError: there is too little of it, which says nothing about the object.
     """
     if size > MOST_BYTES:
         return None
@@ -34,7 +37,7 @@ def expanded(data: bytes, size: int, old: bytes | None = None) -> bytes | None:
         dictionary = None if old is None else _dictionary(old)
         reader = zstandard.ZstdDecompressor(dict_data=dictionary, max_window_size=1 << 31)
         return reader.decompress(data, max_output_size=size)
-    except (zstandard.ZstdError, MemoryError):
+    except zstandard.ZstdError:
         return None
 
 

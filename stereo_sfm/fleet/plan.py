@@ -22,19 +22,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import stereo_sfm
-from stereo_sfm.config import Config, dump, read_toml
+from stereo_sfm.config import Config, read_toml
 from stereo_sfm.config import load as load_config
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.presets import PRESETS, preset
 from stereo_sfm.settings import explained, line, number, path, read, word
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import SUMS
+from stereo_sfm.storage.folders import SUM, SUMS
 from stereo_sfm.storage.remote import Remote, is_uri
 
 SEE = "stereo-sfm fleet run --print-plan"
 UNDATED = "undated"
-_NIGHT = re.compile(r"\d{4}-\d\d-\d\d")
+_NIGHT = re.compile(r"(\d{4})([-_])(\d\d)\2(\d\d)")  # ROS names its bags rosbag2_2026_11_25-22_00_00
 _WHOLE = (SUMS, "map.json")  # one of them in a folder says that all of it has arrived
 
 
@@ -71,7 +70,7 @@ class JobConfig:
 
 @dataclass(frozen=True)
 class Walk:
-    """One recording, or the map that a robot made of it."""
+    """One recording, or the map that a robot made of it; or a store whose walks cannot be listed, and why."""
 
     store: str
     night: str  # YYYY-MM-DD
@@ -80,10 +79,12 @@ class Walk:
     source: str  # address in a bucket, or any other source
     state: str = ""  # tells what was sent from what is sent again under its name
     bytes: int = 0
+    error: str = ""  # of a store
 
-    def key(self, config: Config) -> str:
-        """Of its result: another one for other bytes, another configuration, another version of the program."""
-        about = [self.store, self.source, self.state, dump(config), stereo_sfm.__version__]
+    @property
+    def key(self) -> str:
+        """Of its result: another one for other bytes. A walk is in a map once, whichever program has mapped it."""
+        about = [self.store, self.source, self.state]
         return f"{self.night}_{hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]}"
 
 
@@ -144,9 +145,9 @@ def _listed(file: Path, walks: Any) -> Iterator[Walk]:
 
 def night_of(name: str) -> str:
     """The date in a name, else `UNDATED`."""
-    for found in _NIGHT.findall(name):
+    for year, _, month, day in _NIGHT.findall(name):
         with contextlib.suppress(ValueError):
-            return datetime.date.fromisoformat(found).isoformat()
+            return datetime.date(int(year), int(month), int(day)).isoformat()
     return UNDATED
 
 
@@ -155,33 +156,58 @@ def explain(plan: Plan) -> str:
     return explained(dataclasses.replace(plan, listed=()))
 
 
-def find_walks(plan: Plan) -> tuple[list[Walk], list[str]]:
-    """All walks of the plan's stores by store, night and name; and those that have not arrived as a whole.
+def stores_of(plan: Plan) -> list[str]:
+    """Their names, sorted where the plan does not name them.
 
     Raises:
         StereoSfmError: there is no such bucket, or no right to list it.
     """
     wanted = [name.strip() for name in plan.fleet.stores.split(",") if name.strip()]
-    stores = wanted or sorted({*objects.folders(plan.root), *(walk.store for walk in plan.listed)})
+    return wanted or sorted({*objects.folders(plan.root), *(walk.store for walk in plan.listed)})
+
+
+def find_walks(plan: Plan) -> tuple[list[Walk], list[str]]:
+    """All walks of the plan's stores by store, night and name; and the addresses of what is none, or not whole yet.
+
+    A store that cannot be listed is a walk with an error, and stops no other one.
+
+    Raises:
+        StereoSfmError: there is no such bucket, or none of the stores can be listed.
+    """
+    stores = stores_of(plan)
     walks, waiting = [walk for walk in plan.listed if walk.store in stores], list[str]()
+    lost: list[Walk] = []
     for store in stores:
         place = plan.root / store / "walks"
-        found: dict[str, list[tuple[str, int, str]]] = {}
-        for name, size, tag in objects.listed(place):
-            if name.count("/") >= 1 and not name.endswith(".sha256"):
-                found.setdefault("/".join(name.split("/")[:2]), []).append((name, size, tag))
-        for name, files in found.items():
-            is_file = files[0][0] == name
-            if is_file and not name.endswith(".mcap"):
-                continue
-            if not is_file and not any(file.rpartition("/")[2] in _WHOLE for file, _, _ in files):
-                waiting.append(str(place / name))
-                continue
+        try:
+            found, others = _walks_of(store, place)
+        except StereoSfmError as error:
+            lost.append(Walk(store, UNDATED, "", "", str(place), error=str(error)))
+        else:
+            walks += found
+            waiting += others
+    if lost and len(lost) == len(stores):
+        raise StereoSfmError(lost[0].error)
+    return sorted(walks + lost, key=lambda w: (w.store, w.night, w.name)), waiting
+
+
+def _walks_of(store: str, place: Remote) -> tuple[list[Walk], list[str]]:
+    """Of one store."""
+    found: dict[str, list[tuple[str, int, str]]] = {}
+    for name, size, tag in objects.listed(place):
+        if not name.endswith(SUM):
+            found.setdefault("/".join(name.split("/")[:2]), []).append((name, size, tag))
+    walks, waiting = list[Walk](), list[str]()
+    for name, files in found.items():
+        robot, _, own = name.partition("/")
+        size = sum(size for _, size, _ in files)
+        is_file = files[0][0] == name
+        if is_file and not size and not own.endswith(".mcap"):  # it stands for a folder that is empty now
+            continue
+        names = {file.rpartition("/")[2] for file, _, _ in files}
+        if own.endswith(".mcap") if is_file else not names.isdisjoint(_WHOLE):
             state = hashlib.sha256(repr(files).encode()).hexdigest()[:16]
-            walks.append(
-                Walk(
-                    store, night_of(name.partition("/")[2]), name.partition("/")[0], name, str(place / name), state,
-                    sum(size for _, size, _ in files),
-                )
-            )  # fmt: skip
-    return sorted(walks, key=lambda w: (w.store, w.night, w.name)), waiting
+            walks.append(Walk(store, night_of(own), robot, name, str(place / name), state, size))
+        else:
+            waiting.append(str(place / name))
+    return walks, waiting

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from itertools import groupby, pairwise
-from typing import Any
 
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet import versions
-from stereo_sfm.fleet.plan import UNDATED, Plan, Walk, night_of
-from stereo_sfm.fleet.steps import job_name, map_walk, read_json, update_store
+from stereo_sfm.fleet.editing import holds
+from stereo_sfm.fleet.plan import UNDATED, Plan, Walk, night_of, stores_of
+from stereo_sfm.fleet.steps import BEGUN, RESULT, Night, job_name, map_walk, read_json, update_store
+from stereo_sfm.fleet.versions import read_head, read_version
 from stereo_sfm.jobs import Job, Limits, Result, run_jobs
 from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import SUM
 from stereo_sfm.storage.remote import Remote
-from stereo_sfm.storage.spool import SUM
 
 
 def jobs_of(plan: Plan, walks: list[Walk]) -> list[Job]:
     """A job for each walk, and one for each night of a store, which waits for its walks and for the night before."""
     config, root = plan.config(), plan.root
-    jobs = [Job(job_name(walk), map_walk, (root, walk, config)) for walk in walks]
+    jobs = [Job(walk.store, _lost, (walk.error,)) for walk in walks if walk.error]
+    walks = [walk for walk in walks if not walk.error]
+    jobs += [Job(job_name(walk), map_walk, (root, walk, config)) for walk in walks]
     for _, of_store in groupby(walks, key=lambda w: w.store):
         nights = [list(of_night) for _, of_night in groupby(of_store, key=lambda w: w.night)]
         for before, night in pairwise([None, *nights]):
@@ -28,6 +33,11 @@ def jobs_of(plan: Plan, walks: list[Walk]) -> list[Job]:
             after = [job_name(walk) for walk in night] + ([night_name(before[0])] if before else [])
             jobs.append(Job(night_name(night[0]), update_store, (root, night, config), tuple(after)))
     return jobs
+
+
+def _lost(error: str) -> Result:
+    """Of a store whose walks cannot be listed."""
+    return {"ok": False, "error": error}
 
 
 def night_name(walk: Walk) -> str:
@@ -42,51 +52,109 @@ def run_plan(plan: Plan, address: str | None, walks: list[Walk]) -> Iterator[tup
 
 
 def forget_images(plan: Plan, walks: list[Walk], today: datetime.date, waiting: Sequence[str] = ()) -> int:
-    """Delete recordings that are older than the plan allows; maps, results and tables stay.
+    """Delete recordings that are older than the plan allows, and the maps of walks as old that are in a version.
 
-    Args: walks, of which those whose map is not made yet are kept. waiting: folders that have not arrived as a whole.
+    Results and tables stay. A walk whose map is not in the store yet has so many days again from its first try; then
+    its recording is deleted in any case, and its row says so.
+
+    Args: walks: that there are. waiting: addresses of what is none, or has not arrived as a whole.
 
     Returns:
         Bytes that were deleted.
     """
-    days = plan.fleet.keep_images_days
-    if not days:
+    if not plan.fleet.keep_images_days:
         return 0
+    lost = {walk.store for walk in walks if walk.error}
+    tasks = [partial(_forget_others, plan, place, today) for place in map(Remote.of, waiting)]
+    for store in sorted({*stores_of(plan)} - lost):
+        mine = [walk for walk in walks if walk.store == store]
+        tasks += [partial(_forget_walks, plan, mine, today), partial(_forget_work, plan, store, mine, today)]
+    return _all(tasks)
+
+
+def _forget_others(plan: Plan, place: Remote, today: datetime.date) -> int:
+    """Delete what is old and no walk."""
+    return _delete(place) if _age(night_of(place.name), place, today) > plan.fleet.keep_images_days else 0
+
+
+def _forget_walks(plan: Plan, walks: list[Walk], today: datetime.date) -> int:
+    """Delete the old recordings of a store."""
+    days, deleted = plan.fleet.keep_images_days, 0
+    place = {walk: plan.root / walk.store / "walks" / walk.name for walk in walks}
+    # Without a state the plan names its source itself: it is not ours to delete.
+    old = [w for w in walks if w.state and _age(w.night, place[w], today) > days]
+    for night, found in groupby(old, key=lambda walk: walk.night):
+        known = Night.read(plan.root, old[0].store, night)
+        for walk in found:
+            begun = plan.root / walk.store / "work" / walk.key / BEGUN
+            settled = known.is_settled(walk)
+            if not settled and (not objects.exists(begun) or (today - objects.written(begun)).days <= days):
+                continue
+            deleted += _delete(place[walk])
+            if not settled:  # said afterwards: a store whose tables cannot be written keeps no images of people
+                known.give_up(walk, days)
+    return deleted
+
+
+def _forget_work(plan: Plan, store: str, walks: list[Walk], today: datetime.date) -> int:
+    """Delete the maps of a store's old walks that nobody reads again; their results say that they were made."""
+    place = plan.root / store / "work"
+    names = (name.split("/") for name, _, _ in objects.listed(place))
+    made = {parts[0] for parts in names if parts[1:2] == ["map"]}
+    waited_for = {walk.key for walk in walks}
+    head = read_head(plan.root / store / "map")
+    version = read_version(plan.root / store / "map", head.version) if made and head.version else None
     deleted = 0
-    for place in map(Remote.of, waiting):
-        if (today - _day(night_of(place.name), place)).days > days:
-            files = objects.listed(place)
-            objects.delete([place / name for name, _, _ in files])
-            deleted += sum(size for _, size, _ in files)
-    marks: dict[str, Any] = {}
-    for walk in walks:
-        place = plan.root / walk.store / "walks" / walk.name
-        # Without a state the plan names its source itself: it is not ours to delete.
-        if not walk.state or (today - _day(walk.night, place)).days <= days:
-            continue
-        marker = plan.root / walk.store / "catalogue" / f"{walk.night}.json"
-        if str(marker) not in marks:
-            marks[str(marker)] = (read_json(marker) or {}).get("walks", {})
-        if walk.name not in marks[str(marker)]:  # it came late: its map is made first
-            continue
-        names = [name for name, _, _ in objects.listed(place)]
-        beside = place.parent / f"{place.name}{SUM}"
-        objects.delete([place / name for name in names] if names else [place, beside])
-        deleted += walk.bytes
+    for key in sorted(made):
+        result = read_json(place / key / RESULT) or {}
+        needed = key in waited_for and not holds(head, version, str(result.get("id")))
+        if not needed and _age(night_of(key), place / key, today) > plan.fleet.keep_images_days:
+            deleted += _delete(place / key / "map")
     return deleted
 
 
 def forget_versions(plan: Plan, stores: Iterable[str]) -> int:
     """Delete the files of versions that the plan does not keep; bytes of them."""
-    deleted = 0
-    for store in stores if plan.fleet.keep_versions else ():
+
+    def forget(store: str) -> int:
         with contextlib.suppress(objects.Changed):  # somebody writes this store: next night
-            deleted += versions.forget_versions(plan.root / store / "map", plan.fleet.keep_versions)
-    return deleted
+            return versions.forget_versions(plan.root / store / "map", plan.fleet.keep_versions)
+        return 0
+
+    return _all([partial(forget, store) for store in stores]) if plan.fleet.keep_versions else 0
 
 
-def _day(night: str, place: Remote) -> datetime.date:
-    """Of a recording: by its name, else when the newest of its files was written."""
+def _all(tasks: Iterable[Callable[[], int]]) -> int:
+    """The sum of what they return; none stops another one.
+
+    Raises:
+        StereoSfmError: of the first one that failed, after all others.
+    """
+    total, errors = 0, list[StereoSfmError]()
+    for task in tasks:
+        try:
+            total += task()
+        except StereoSfmError as error:
+            errors.append(error)
+    if errors:
+        raise errors[0]
+    return total
+
+
+def _delete(place: Remote) -> int:
+    """A file or a folder, and the checksum beside it; bytes that they had."""
+    files = objects.listed(place)
+    if files:
+        objects.delete(place / name for name, _, _ in files)
+        return sum(size for _, size, _ in files)
+    size = objects.size_and_tag(place)[0]
+    objects.delete([place, place.parent / f"{place.name}{SUM}"])
+    return size
+
+
+def _age(night: str, place: Remote, today: datetime.date) -> int:
+    """Days since a night, else since the newest file of a place was written."""
     if night != UNDATED:
-        return datetime.date.fromisoformat(night)
-    return max(objects.written(file) for file in [place / name for name, _, _ in objects.listed(place)] or [place])
+        return (today - datetime.date.fromisoformat(night)).days
+    files = [place / name for name, _, _ in objects.listed(place)] or [place]
+    return (today - max(map(objects.written, files))).days

@@ -1,35 +1,40 @@
 """The steps of a night, each of which may be repeated: what is done already is found, not done twice.
 
-A walk becomes a session's map and a result, under a name that depends on its bytes, its configuration and the version
-of the program. A night's sessions become one version of the store's map: the exchange of the store's head is the only
-moment at which anything counts, so a worker that is killed before has changed nothing.
+A walk becomes a session's map and a result, under a name that depends on its bytes alone. A night's sessions become one
+version of the store's map: the exchange of the store's head is the only moment at which anything counts, so a worker
+that is killed before has changed nothing.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import itertools
 import json
-import time
+import os
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from stereo_sfm.config import Config
-from stereo_sfm.errors import StereoSfmError
+import stereo_sfm
+from stereo_sfm.config import Config, dump
+from stereo_sfm.errors import Hindered, StereoSfmError
 from stereo_sfm.eval.stats_file import checked_stats
 from stereo_sfm.fleet.catalogue import night_tables, walk_row, write_tables
 from stereo_sfm.fleet.editing import Checkout, checked_out, session_id
 from stereo_sfm.fleet.plan import Walk
-from stereo_sfm.fleet.versions import Version, history
+from stereo_sfm.fleet.versions import Version, history, read_head
 from stereo_sfm.fleet.work_folder import work_folder
 from stereo_sfm.input_file import read_json as read_file
 from stereo_sfm.jobs import Result
+from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import SUMS, fetch_into, send_folder
 from stereo_sfm.storage.remote import Remote
 
-RESULT = "result.json"
+RESULT, BEGUN = "result.json", "begun"
 WRITERS = 10  # tries to write a version while others do
 
 
@@ -48,23 +53,32 @@ class Outcome(NamedTuple):
 def map_walk(root: Remote, walk: Walk, config: Config) -> Result:
     """A session's own map in the bucket, and the numbers of its run.
 
-    A failure is kept as well where it is one of the bytes, which fail again: not that of the network, of a limit, of an
-    error of ours, nor of a source that the plan names itself.
+    A map counts for good: a walk that another program, or one with another configuration, has mapped is not mapped
+    again. A failure is kept as well, for this program and configuration, where it is one of the bytes, which fail
+    again: not that of a right, of the network, of a limit, of an error of ours, nor of a source that the plan names.
     """
-    place = root / walk.store / "work" / walk.key(config)
+    place = root / walk.store / "work" / walk.key
+    by = hashlib.sha256(json.dumps([stereo_sfm.__version__, dump(config)]).encode()).hexdigest()[:16]
     done = read_json(place / RESULT)
-    if done is not None:
+    if done is not None and (done.get("ok") or done.get("by") == by):
         return {**done, "resumed": True}
-    begin = time.perf_counter()
+    objects.create(place / BEGUN, b"begun\n")  # keeps the day of the first try
+    begin = processor_s()
     with work_folder() as folder:
         result = _mapped(walk, config, folder)
         if result["ok"]:
             result["session_bytes"] = send_folder(Path(result.pop("map")), place / "map")
             result["session"] = str(place / "map")
-    result["cost_s"] = time.perf_counter() - begin
+    about = {"by": by, "cost_s": processor_s() - begin, "health": _health(result.get("stats"))}
+    result = {"software": f"stereo-sfm {stereo_sfm.__version__}", **result, **about}
     if result.setdefault("lasting", True):
         objects.write(place / RESULT, json.dumps(result, default=str).encode())
     return result
+
+
+def processor_s() -> float:
+    """Seconds of processor time that this process and its children have had."""
+    return sum(os.times()[:4])
 
 
 def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
@@ -81,7 +95,7 @@ def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
             if made is not None:
                 session = load_map(made)
                 save_map(session, folder / "map", compress=False)
-                about = _about(session, session_id(session))
+                about = _about(session, session_id(session)) | {"software": _software_of(here)}
                 return about | {"ok": True, "map": str(folder / "map"), "stats": _stats_of(here)}
             source = str(here)
         elif walk.state:
@@ -89,11 +103,12 @@ def _mapped(walk: Walk, config: Config, folder: Path) -> Result:
                 if reader.truncated:
                     return {"ok": False, "error": f"it is cut off ({reader.truncated}): send it again"}
     except StereoSfmError as error:
-        return {"ok": False, "error": str(error), "lasting": not isinstance(error, objects.Unreachable)}
+        lasting = not isinstance(error, Hindered | objects.Missing)
+        return {"ok": False, "error": str(error), "lasting": lasting}
     result = run_one(BatchTask(source, str(folder / "run"), config, True))
     if not result["ok"]:
-        ours = result.get("kind") in (None, objects.Unreachable.__name__)
-        return {"ok": False, "error": result["error"], "lasting": bool(walk.state) and not ours}
+        lasting = bool(walk.state) and not result.get("hindered", True)  # of an error of ours nothing is said
+        return {"ok": False, "error": result["error"], "lasting": lasting}
     try:
         session = load_map(folder / "run" / "map")
     except StereoSfmError:
@@ -109,6 +124,29 @@ def _stats_of(run: Path) -> dict[str, Any] | None:
         return checked_stats(read_file(run / "stats.json"))
     except (OSError, ValueError):
         return None
+
+
+def _software_of(run: Path) -> str | None:
+    """Which program made the run whose folder a robot has sent; None where it has sent its map alone."""
+    try:
+        with LogReader(run / "run.mcap") as reader:
+            version = reader.metadata(METADATA).get("version")
+    except (OSError, StereoSfmError):
+        return None
+    return f"stereo-sfm {version}" if version else None
+
+
+def _health(stats: dict[str, Any] | None) -> str | None:
+    """What the report of a run warns of, "" if it is well; None where its numbers are not known."""
+    if stats is None:
+        return None
+    from stereo_sfm.eval.report import verdicts
+
+    try:
+        said = verdicts(stats, {})
+    except (LookupError, TypeError, ValueError, AttributeError):  # of another version of the program
+        return None
+    return "; ".join(line.partition(": ")[2] or line for line in said if not line.startswith("**PASS**"))
 
 
 def _about(session: Any, identity: str) -> dict[str, Any]:
@@ -138,29 +176,84 @@ def update_store(root: Remote, walks: list[Walk], config: Config, results: Mappi
         root: of all stores. walks: of this night, by name. config: of all.
         results: of `map_walk`, by the name of its job; others are of earlier nights, which are only waited for.
     """
-    store, night = walks[0].store, walks[0].night
-    marker = root / store / "catalogue" / f"{night}.json"
-    mine = {walk: results[job_name(walk)] for walk in walks}
-    wanted = {walk.name: walk.key(config) for walk in walks}
-    done = read_json(marker)
-    before: dict[str, Any] = done["rows"] if done is not None else {}
-    if done is not None and all(done["walks"].get(name) == key for name, key in wanted.items()):
-        return {"ok": True, "version": done["version"], "failed": done["failed"], "resumed": True}
-    begin = time.perf_counter()
-    place = root / store / "map"
-    outcomes, version = _put_all(place, mine, config)
-    lasting = all(result.get("lasting") and not outcomes[walk].again for walk, result in mine.items())
-    failed = {walk.name: outcome.why for walk, outcome in outcomes.items() if outcome.why}
-    # Walks whose recordings were deleted since keep their rows.
-    rows = before | {walk.name: walk_row(walk, mine[walk], o.why, o.session) for walk, o in outcomes.items()}
-    versions = history(place) if version is not None else []
-    tables = night_tables(store, night, [rows[k] for k in sorted(rows)], versions, time.perf_counter() - begin)
-    write_tables(root / store / "catalogue", night, tables)
-    result = {"version": version.number if version else 0, "failed": failed}
-    if lasting:
-        known = done["walks"] if done is not None else {}
-        objects.write(marker, json.dumps({**result, "walks": known | wanted, "rows": rows}).encode())
-    return {"ok": True, **result}
+    night = Night.read(root, walks[0].store, walks[0].night)
+    results = {walk.name: results[job_name(walk)] for walk in walks}
+    mine = {walk: results[walk.name] for walk in walks if not night.knows(walk, results[walk.name])}
+    if mine:
+        begin = processor_s()
+        outcomes, made = _put_all(root / night.store / "map", mine, config)
+        cost_s = processor_s() - begin
+        for walk, outcome in outcomes.items():
+            night.add(walk, mine[walk], outcome, cost_s / len(mine))
+        if made is not None:
+            night.version = made.number
+            night.costs[str(made.number)] = cost_s
+        night.write()
+    failed = {walk.name: night.rows[walk.name]["why"] for walk in walks if night.rows[walk.name]["why"]}
+    return {"ok": True, "version": night.version, "failed": failed} | ({} if mine else {"resumed": True})
+
+
+@dataclass
+class Night:
+    """What is known of a night of a store: the rows of its walks, and which of them need nothing more."""
+
+    root: Remote
+    store: str
+    night: str
+    version: int = 0  # the last one that it made
+    rows: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the catalogue, by walk
+    settled: dict[str, list[str]] = field(default_factory=dict)  # walk -> its key, and what was made of it
+    costs: dict[str, float] = field(default_factory=dict)  # version -> seconds of processor time
+
+    @staticmethod
+    def read(root: Remote, store: str, night: str) -> Night:
+        """An empty one where nothing is known."""
+        out = Night(root, store, night)
+        data = read_json(out._place) or {}
+        names = ("version", "rows", "settled", "costs")
+        return dataclasses.replace(out, **{name: data[name] for name in names if name in data})
+
+    @property
+    def _place(self) -> Remote:
+        return self.root / self.store / "catalogue" / f"{self.night}.json"
+
+    def is_settled(self, walk: Walk) -> bool:
+        """Whether these bytes are in the map, or never will be."""
+        return self.settled.get(walk.name, [""])[0] == walk.key
+
+    def knows(self, walk: Walk, result: Result) -> bool:
+        """Whether nothing more is to be done: a map was put in, or refused, or the same failure is known already."""
+        tried = self.is_settled(walk) and bool(self.rows[walk.name]["session"])
+        return tried or self.settled.get(walk.name) == _made(walk, result)
+
+    def add(self, walk: Walk, result: Result, outcome: Outcome, cost_s: float) -> None:
+        """A walk that was tried. Args: cost_s, processor time of putting it into the map."""
+        self.rows[walk.name] = walk_row(walk, result, outcome.why, outcome.session, cost_s)
+        self.settled.pop(walk.name, None)
+        if result.get("lasting") and not outcome.again:
+            self.settled[walk.name] = _made(walk, result)
+
+    def give_up(self, walk: Walk, days: int) -> None:
+        """Say of a walk that its recording was deleted after so many days, and it is in no map."""
+        row = self.rows.setdefault(walk.name, walk_row(walk, {}, "", ""))
+        said = f"its recording was deleted after {days} days"
+        if said not in row["why"]:
+            row |= {"ok": False, "why": f"{row['why']}; {said}" if row["why"] else said}
+            self.write()
+
+    def write(self) -> None:
+        """The tables of the catalogue, and what is known. Walks whose recordings were deleted since keep their rows."""
+        place = self.root / self.store
+        versions = history(place / "map") if read_head(place / "map").version else []
+        rows = [self.rows[name] for name in sorted(self.rows)]
+        write_tables(place / "catalogue", self.night, night_tables(self.store, self.night, rows, versions, self.costs))
+        kept = {"version": self.version, "rows": self.rows, "settled": self.settled, "costs": self.costs}
+        objects.write(self._place, json.dumps(kept).encode())
+
+
+def _made(walk: Walk, result: Result) -> list[str]:
+    """The key of a walk and the session, or the failure, that is known of it."""
+    return [walk.key, str(result.get("id") or result.get("by"))]
 
 
 def job_name(walk: Walk) -> str:
@@ -172,13 +265,19 @@ Outcomes = dict[Walk, Outcome]
 
 
 def _put_all(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tuple[Outcomes, Version | None]:
-    """The sessions of a night put into the version that counts, as one new version; None: the store has none.
+    """The sessions of a night put into the version that counts, as one new version; None: there was nothing to put.
 
     Where another program is faster, they are put into its version.
     """
+    good = {walk: result for walk, result in mine.items() if result["ok"]}
+    whys = {walk: str(result["error"]) for walk, result in mine.items() if not result["ok"]}
+    failed = {walk: Outcome(why.strip().splitlines()[-1], "") for walk, why in whys.items()}
+    if not good:
+        return failed, None
     for attempt in itertools.count(1):
         try:
-            return _put_once(place, mine, config)
+            outcomes, made = _put_once(place, good, config)
+            return failed | outcomes, made
         except objects.Changed:
             if attempt == WRITERS:
                 raise
@@ -194,9 +293,9 @@ def _put_once(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tup
         sessions: dict[str, str] = {}
         changes: list[str] = []
         for walk, result in mine.items():
-            identity = str(result.get("id", ""))
-            outcomes[walk] = Outcome("" if result["ok"] else result["error"].strip().splitlines()[-1], identity)
-            if not result["ok"] or identity in sessions:
+            identity = str(result["id"])
+            outcomes[walk] = Outcome("", identity)
+            if identity in sessions:
                 continue
             held = out.holds(identity)
             if held:
@@ -205,14 +304,14 @@ def _put_once(place: Remote, mine: Mapping[Walk, Result], config: Config) -> tup
             try:
                 changes += _put(out, walk, result, config)
                 sessions[identity] = f"{walk.night} {walk.name}"
-            except (objects.Unreachable, TimeoutError, MemoryError):
+            except (Hindered, TimeoutError, MemoryError):
                 raise
             except Exception as error:  # one walk stops no night
                 why = str(error).strip().partition("\n")[0] or type(error).__name__
                 again = isinstance(error, Damaged) or not isinstance(error, StereoSfmError)
                 outcomes[walk] = Outcome(why, identity, again)
         if not sessions:
-            return outcomes, out.version
+            return outcomes, None
         try:
             write_store_plan(out.folder)
         except StereoSfmError as error:
@@ -231,7 +330,7 @@ def _put(out: Checkout, walk: Walk, result: Result, config: Config) -> list[str]
             session = load_map(folder / "map")
             if session_id(session) != result["id"]:
                 raise StereoSfmError(f"{made} is not what was made")
-        except objects.Unreachable:
+        except Hindered:
             raise
         except StereoSfmError as error:
             objects.delete([made.parent / RESULT, made / SUMS])

@@ -1,7 +1,7 @@
 """The versions of a store's map in a bucket.
 
     STORE/head.json                   the version that counts: exchanged on the condition that nobody else did
-    STORE/release.json                the version of each robot; without it all have the head's
+    STORE/release.json                the version of each robot; without it, or if that was rolled back, the head's
     STORE/versions/00012-5f0c...json  a version: its files, its sessions, its parent; never changed
     STORE/files/00012-5f0c.../SHA256.zst    a file as a whole, of the version that wrote it
     STORE/patches/00012-5f0c.../SHA256.zst  the same file as its differences from the parent's
@@ -19,8 +19,9 @@ import hashlib
 import json
 import re
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -87,6 +88,7 @@ class Head:
     refused: tuple[str, ...] = ()  # sessions of versions that were rolled back: they are not put in again
     by: str = ""
     oldest: int = 0  # number of the first version whose files are kept, besides those that robots were given
+    undone: tuple[str, ...] = ()  # names of versions that were rolled back: no robot is given them
     tag: str | None = None  # of the object; None: there is none
 
     def text(self) -> bytes:
@@ -113,7 +115,8 @@ def read_head(store: Remote) -> Head:
         return Head()
 
     def make(data: dict[str, Any]) -> Head:
-        return Head(data["version"], data["next"], tuple(data["refused"]), data["by"], data.get("oldest", 0), tag)
+        refused, undone = tuple(data["refused"]), tuple(data.get("undone", ()))
+        return Head(data["version"], data["next"], refused, data["by"], data.get("oldest", 0), undone, tag)
 
     return _parsed(store / HEAD, raw, make)
 
@@ -141,7 +144,10 @@ def current(store: Remote) -> Version:
     Raises:
         StereoSfmError: there is none yet.
     """
-    head = read_head(store)
+    return _counting(store, read_head(store))
+
+
+def _counting(store: Remote, head: Head) -> Version:
     if not head.version:
         raise StereoSfmError(f"no map at {store}: 'stereo-sfm map update {store} SESSION' begins one")
     return read_version(store, head.version)
@@ -149,10 +155,22 @@ def current(store: Remote) -> Version:
 
 def history(store: Remote) -> list[Version]:
     """The version that counts and those before it, newest first."""
-    out = [current(store)]
-    while out[-1].parent:
-        out.append(read_version(store, out[-1].parent))
-    return out
+    now = current(store)
+    return [now, *_chain(store, now.parent)]
+
+
+def _chain(store: Remote, name: str) -> Iterator[Version]:
+    """A version by its name, and those before it."""
+    while name:
+        version = read_version(store, name)
+        yield version
+        name = version.parent
+
+
+def _counts(store: Remote, version: Version) -> bool:
+    """Whether it is the version that counts, or one before it."""
+    newer = takewhile(lambda v: v.number >= version.number, _chain(store, read_head(store).version))
+    return version.name in [v.name for v in newer]
 
 
 def numbered(store: Remote, number: int) -> Version:
@@ -182,7 +200,8 @@ def publish(
         changes: lines for people. software: that made it.
 
     Raises:
-        Changed: another program has written a version since `head` was read; this one is not in the store.
+        Changed: another program has written a version since `head` was read; this one is not in the store. Where it
+            was written after this one, whose answer was lost, nothing is raised.
     """
     before = read_version(store, head.version) if head.version else None
     by = secrets.token_hex(8)
@@ -199,8 +218,9 @@ def publish(
     try:
         _exchange(store, dataclasses.replace(head, version=version.name, next=head.next + 1, by=by))
     except objects.Changed:
-        objects.delete([store / version.name])
-        raise
+        if not _counts(store, version):
+            objects.delete([store / version.name])
+            raise
     return version
 
 
@@ -243,21 +263,23 @@ def read_file(store: Remote, file: StoredFile) -> bytes:
 def roll_back(store: Remote) -> Version:
     """Let the version before count again. The sessions of the one that counted are not put in again by themselves.
 
-    Robots that were given the one that counted have what counts, again.
+    Robots that were given the one that counted have what counts, again. One exchange of the head does all of it.
 
     Raises:
         StereoSfmError: there is none before. Changed: another program has written meanwhile.
     """
     head = read_head(store)
-    now = current(store)
+    now = _counting(store, head)
     before = read_version(store, now.parent) if now.parent else None
     if before is None or before.number < head.oldest:
         raise StereoSfmError(f"no earlier version of {store} is kept")
     refused = sorted({*head.refused, *(now.sessions.keys() - before.sessions.keys())})
-    _exchange(store, dataclasses.replace(head, version=before.name, refused=tuple(refused), by=secrets.token_hex(8)))
-    given, tag = _released(store)
-    if now.name in given.values():
-        _give(store, {robot: name for robot, name in given.items() if name != now.name}, tag)
+    undone, by = (*head.undone, now.name), secrets.token_hex(8)
+    try:
+        _exchange(store, dataclasses.replace(head, version=before.name, refused=tuple(refused), undone=undone, by=by))
+    except objects.Changed:
+        if _counts(store, now):  # else the answer was lost, and there is a version after it
+            raise
     return before
 
 
@@ -278,7 +300,7 @@ def forget_versions(store: Remote, keep: int) -> int:
         return 0
     oldest = last[-1].number
     _exchange(store, dataclasses.replace(head, oldest=oldest, by=secrets.token_hex(8)))
-    given, _ = _released(store)
+    given, _ = _released(store, head)
     found = objects.listed(store)
     kept = {name for name, _, _ in found if (m := _MANIFEST.fullmatch(name)) and int(m[1]) >= oldest}
     named: set[str] = set()
@@ -302,34 +324,33 @@ def release(store: Remote, number: int, robots: tuple[str, ...] = ()) -> None:
     """Give a version to some robots, or to all of them.
 
     Raises:
-        StereoSfmError: there is no such version, or its files were deleted.
+        StereoSfmError: there is no such version, it was rolled back, or its files were deleted.
         Changed: another program has released one meanwhile.
     """
-    name = numbered(store, number).name
-    given, tag = _released(store)
-    if number < read_head(store).oldest and name not in given.values():
+    name, head = numbered(store, number).name, read_head(store)
+    if name in head.undone:
+        raise StereoSfmError(f"version {number} of {store} was rolled back: no robot is given it; release another one")
+    given, tag = _released(store, head)
+    if number < head.oldest and name not in given.values():
         raise StereoSfmError(f"the files of version {number} of {store} were deleted: it is too old (keep_versions)")
     given = {**given, **dict.fromkeys(robots, name)} if robots else {"": name}
-    _give(store, given, tag)
-
-
-def _give(store: Remote, given: Mapping[str, str], tag: str | None) -> None:
-    """Write the version of each robot, on the condition that nobody else did."""
     data = {"kind": KIND, "by": secrets.token_hex(8), "robots": given}
     objects.exchange(store / RELEASE, (json.dumps(data, indent=1, sort_keys=True) + "\n").encode(), tag)
 
 
-def _released(store: Remote) -> tuple[dict[str, str], str | None]:
-    """Version by robot ("": all others), and the tag of the object."""
+def _released(store: Remote, head: Head) -> tuple[dict[str, str], str | None]:
+    """Version by robot ("": all others), without those that were rolled back, and the tag of the object."""
     try:
         raw, tag = objects.read_tagged(store / RELEASE)
     except objects.Missing:
         return {}, None
-    return _parsed(store / RELEASE, raw, lambda d: {str(k): str(v) for k, v in d["robots"].items()}), tag
+    given = _parsed(store / RELEASE, raw, lambda d: {str(k): str(v) for k, v in d["robots"].items()})
+    return {robot: name for robot, name in given.items() if name not in head.undone}, tag
 
 
 def released(store: Remote, robot: str = "") -> Version:
     """The version that a robot should have: its own, else that of all, else the one that counts."""
-    given, _ = _released(store)
+    head = read_head(store)
+    given, _ = _released(store, head)
     name = given.get(robot, given.get(""))
-    return read_version(store, name) if name else current(store)
+    return read_version(store, name) if name else _counting(store, head)

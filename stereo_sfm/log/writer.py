@@ -21,7 +21,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import Hindered, StereoSfmError
 from stereo_sfm.log import repair, schema
 from stereo_sfm.log.topics import BY_NAME
 from stereo_sfm.log.whole_file import WholeFile
@@ -226,7 +226,7 @@ class LogWriter:
             action()
         except OSError as error:
             self.closed = True
-            self._failure = StereoSfmError(f"recording stopped, {error.strerror or error}: {self._kept()}")
+            self._failure = Hindered(f"recording stopped, {error.strerror or error}: {self._kept()}")
             raise self._failure from None
 
     def _kept(self) -> str:

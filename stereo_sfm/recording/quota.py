@@ -33,7 +33,8 @@ class Quota:
     bytes: float
     percent: float = 100.0  # of the disk
     min_free: float = 0.0  # bytes
-    sent_only: bool = False  # what is not in the bucket yet is never deleted
+    sent_only: bool = False  # what is to be in the bucket and is not there yet is never deleted
+    black_box: bool = False  # images of unmarked segments are not to be there
 
     def most(self, disk: Disk) -> float:
         """Bytes that recordings may have."""
@@ -47,6 +48,10 @@ class Quota:
         """Bytes that should be free and are not."""
         return max(self.min_free - disk.free, 0.0)
 
+    def waiting(self, segment: Segment) -> list[Path]:
+        """Files of a segment that are not to be deleted before they are sent."""
+        return segment.unsent(self.black_box) if self.sent_only else []
+
 
 def used_bytes(root: Path) -> int:
     """Bytes of all recordings."""
@@ -58,7 +63,7 @@ def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[
 
     Segments that a person marked stay. Those that the service marked itself count as marked while they are the newest
     ones in a part of the quota, and go after the unmarked ones: however many losses there are, there is room for what
-    comes. Poses are never deleted because something else has filled the disk.
+    comes. Poses are never deleted because something else has filled the disk. What waits for its upload stays.
 
     Args:
         root: of the recordings. current: being written, never deleted. disk: how full the disk is.
@@ -68,37 +73,41 @@ def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[
     """
     excess = quota.excess(used_bytes(root), disk(root))
     share = AUTOMATIC_SHARE * quota.most(disk(root))
-    for segment in _in_order(root, share, current, quota.sent_only) if excess > 0 else ():
+    whole = _in_order(root, share, current, lambda s: not quota.waiting(s)) if excess > 0 else []
+    for segment in whole:
         excess -= segment.bytes
         segment.delete()
         if excess <= 0:
             break
-    _free_images(_in_order(root, share, current, quota.sent_only), quota.lacking(disk(root)))
+    images = _in_order(root, share, current, lambda s: s.images not in quota.waiting(s))
+    excess -= _free_images(images, max(excess, quota.lacking(disk(root))))
     return max(excess, 0.0)
 
 
-def _in_order(root: Path, share: float, current: Segment | None, sent_only: bool) -> list[Segment]:
-    """The segments that may be deleted, first those that go first.
+def _in_order(root: Path, share: float, current: Segment | None, may_go: Callable[[Segment], bool]) -> list[Segment]:
+    """The segments that `may_go`, first those that go first; neither the current one nor those that a person marked.
 
-    Args: share, bytes of the newest segments with automatic marks that go last. sent_only: what is in the bucket alone.
+    Args: share, bytes of the newest segments with automatic marks that go last.
     """
     first, last = list[Segment](), list[Segment]()
     for segment in (s for folder in reversed(recordings(root)) for s in reversed(segments(folder))):
-        if segment == current or segment.marked_by_hand or (sent_only and not segment.sent):
+        if segment == current or segment.marked_by_hand or not may_go(segment):
             continue
         share -= segment.bytes if segment.marked else 0
         (last if segment.marked and share >= 0 else first).append(segment)
     return [*reversed(first), *reversed(last)]
 
 
-def _free_images(candidates: list[Segment], lacking: float) -> None:
-    """Delete images in this order until so many bytes are free."""
+def _free_images(candidates: list[Segment], lacking: float) -> int:
+    """Delete images in this order until so many bytes are free; returns the bytes that were deleted."""
+    freed = 0
     for segment in candidates:
-        if lacking <= 0:
-            return
+        if freed >= lacking:
+            break
         if segment.images.exists():
-            lacking -= segment.images.stat().st_size
+            freed += segment.images.stat().st_size
             segment.images.unlink()
+    return freed
 
 
 def forget_images(root: Path, keep_s: float, segment_s: float, current: Segment | None) -> int:

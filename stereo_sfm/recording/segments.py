@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
+import os
 import re
 import shutil
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from stereo_sfm.input_file import open_regular, read_bytes, read_json
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.scan import summary_is_whole
+from stereo_sfm.storage.folders import read_sums
 
 KIND = "stereo_sfm_recording"
 POSES, MARKED = ".mcap", ".marked"
@@ -83,20 +85,11 @@ class Segment:
             return True
         return not lines or not all(line.startswith(AUTOMATIC) for line in lines)
 
-    @property
-    def sent_names(self) -> set[str]:
-        """The files of its recording that are in a bucket."""
-        try:
-            lines = read_bytes(self.folder / SENT).decode(errors="replace").splitlines()
-        except OSError:
-            return set()
-        return {line.partition("  ")[2] for line in lines}
-
-    @property
-    def sent(self) -> bool:
-        """Whether all of it is in a bucket."""
-        names = self.sent_names
-        return all(path.name in names for path in (self.poses, self.images) if path.exists())
+    def unsent(self, black_box: bool = False) -> list[Path]:
+        """Its files that are to be in a bucket and are not there yet: of a black box, images of marked ones alone."""
+        names = read_sums(sent_lines(self.folder).decode(errors="replace"))
+        wanted = [self.poses] if black_box and not self.marked else [self.poses, self.images, self.mark_file]
+        return [path for path in wanted if path.name not in names and path.is_file()]
 
     @property
     def bytes(self) -> int:
@@ -115,19 +108,43 @@ class Segment:
         for path in (self.images, self.poses, self.mark_file):
             path.unlink(missing_ok=True)
         if not segments(self.folder):
-            if not (self.folder / SENT).exists() or sent_whole(self.folder):  # else its checksums are still to be sent
+            if not sent_lines(self.folder) or sent_whole(self.folder):  # else its checksums are still to be sent
                 for name in (RECORDING, SENT):
                     (self.folder / name).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it holds other files
                 self.folder.rmdir()
 
 
+_not_written: dict[Path, bytes] = {}  # lines of SHA256SUMS that the disk did not take, by recording
+
+
+def sent_lines(folder: Path) -> bytes:
+    """The SHA256SUMS of a recording: its files that are in a bucket; empty where there are none."""
+    try:
+        written = read_bytes(folder / SENT)
+    except OSError:
+        written = b""
+    return written + _not_written.get(folder, b"")
+
+
+def add_sent(folder: Path, lines: bytes) -> None:
+    """Add lines to the SHA256SUMS of a recording. What a full disk does not take, this process knows, and writes with
+    the next lines: the quota can delete what is in a bucket, and nothing is sent twice."""
+    lines = _not_written.get(folder, b"") + lines
+    size = _size(folder / SENT)
+    try:
+        with (folder / SENT).open("ab") as stream:
+            stream.write(lines)
+        _not_written.pop(folder, None)
+    except OSError:
+        _not_written[folder] = lines
+        with contextlib.suppress(OSError):  # no part of a line
+            os.truncate(folder / SENT, size)
+
+
 def sent_whole(folder: Path) -> bool:
     """Whether all of a recording is in a bucket, and its checksums with it."""
-    try:
-        return read_bytes(folder / SENT).endswith(SENT_END)
-    except OSError:
-        return False
+    return sent_lines(folder).endswith(SENT_END)
 
 
 def _size(path: Path) -> int:

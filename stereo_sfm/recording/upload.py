@@ -14,9 +14,19 @@ from pathlib import Path
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import read_bytes
 from stereo_sfm.log.whole_file import being_written
-from stereo_sfm.recording.segments import RECORDING, SENT, SENT_END, Segment, recordings, segments, sent_whole
+from stereo_sfm.recording.segments import (
+    RECORDING,
+    SENT,
+    SENT_END,
+    Segment,
+    add_sent,
+    recordings,
+    segments,
+    sent_lines,
+    sent_whole,
+)
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import SUMS, Pace, send_file, sha256
+from stereo_sfm.storage.folders import SUMS, Pace, send_file, sha256, sums_text
 from stereo_sfm.storage.remote import Remote
 
 log = logging.getLogger("stereo_sfm")
@@ -95,30 +105,24 @@ class Uploader:
         return count
 
     def _send(self, segment: Segment) -> int:
-        paths = [segment.poses, segment.images, segment.mark_file]
-        if self._black_box and not segment.marked:
-            paths = [segment.poses]
-        count = 0
+        paths = segment.unsent(self._black_box)
         for path in paths:
-            if path.is_file() and path.name not in segment.sent_names:
-                digest = sha256(path)
-                send_file(path, self.to / path.parent.name / path.name, self._pace, self._over.is_set)
-                with (segment.folder / SENT).open("a", encoding="utf-8") as stream:
-                    stream.write(f"{digest}  {path.name}\n")
-                count += 1
-        return count
+            digest = sha256(path)
+            send_file(path, self.to / path.parent.name / path.name, self._pace, self._over.is_set)
+            add_sent(segment.folder, sums_text({path.name: digest}))
+        return len(paths)
 
     def _finish(self, folder: Path) -> None:
         """All of a recording is up."""
-        sent = folder / SENT
-        if not sent.is_file():
+        sent = sent_lines(folder)
+        if not sent:
             return
         about = folder / RECORDING
         if about.is_file():
             objects.write(self.to / folder.name / RECORDING, read_bytes(about))
-        objects.write(self.to / folder.name / SUMS, read_bytes(sent))
-        sent.write_bytes(read_bytes(sent) + SENT_END)
+        objects.write(self.to / folder.name / SUMS, sent)
+        add_sent(folder, SENT_END)
         if not segments(folder):  # the quota has removed them meanwhile
-            for path in (about, sent):
+            for path in (about, folder / SENT):
                 path.unlink(missing_ok=True)
             folder.rmdir()

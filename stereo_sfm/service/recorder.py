@@ -45,7 +45,7 @@ HELD = 6  # images that the recorder has not read yet
 def policy_of(config: RecordingConfig, mode: str) -> Policy:
     """The recorder's policy, from the settings."""
     c = config
-    quota = Quota(c.quota_gb * GB, c.quota_percent, c.min_free_gb * GB, bool(c.upload) and mode != "black_box")
+    quota = Quota(c.quota_gb * GB, c.quota_percent, c.min_free_gb * GB, bool(c.upload), mode == "black_box")
     return Policy(
         Path(c.folder), mode, c.image_format, 60 * c.segment_min, c.segment_mb * 1e6, quota, 60 * c.black_box_min,
         c.mark_before_s, c.mark_after_s, c.upload, c.upload_mbit * 1e6 / 8,

@@ -21,6 +21,7 @@ from stereo_sfm.storage.remote import Remote
 from stereo_sfm.storage.stream import RangeStream
 
 SUMS = "SHA256SUMS"
+SUM = ".sha256"  # ends the name of an object beside a single file: its checksum, in the same form
 PIECE = 1 << 20  # bytes read at a time
 
 
@@ -29,6 +30,15 @@ def cache_root() -> Path:
     named = os.environ.get("STEREO_SFM_CACHE")
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stereo-sfm"
     return Path(named) if named else base
+
+
+def state_root() -> Path:
+    """Where is kept what must not be lost: the user's folder for state (XDG_STATE_HOME).
+
+    Raises:
+        RuntimeError: this user has no home folder.
+    """
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stereo-sfm"
 
 
 def sha256(path: Path) -> str:
@@ -117,6 +127,8 @@ def _fetch_files(remote: Remote, files: list[tuple[str, int, str]], target: Path
         fetch_file(remote / name if name else remote, target / name if name else target, size)
     if target.is_dir():
         check_sums(target, str(remote))
+    else:
+        _check_sum(target, remote)
 
 
 def fetch_file(remote: Remote, path: Path, size: int) -> None:
@@ -159,8 +171,24 @@ def check_sums(folder: Path, name: str) -> None:
             raise StereoSfmError(f"{name}: {file} is not what was sent (its checksum is wrong): send it again")
 
 
+def _check_sum(file: Path, remote: Remote) -> None:
+    """Compare a file with the checksum beside its object, if there is one. Raises StereoSfmError as `check_sums`."""
+    try:
+        digest = objects.read(sum_of(remote)).partition(b" ")[0]
+    except objects.Missing:
+        return
+    if digest != sha256(file).encode():
+        raise StereoSfmError(f"{remote} is not what was sent (its checksum is wrong): send it again")
+
+
+def sum_of(remote: Remote) -> Remote:
+    """The object with the checksum of a single file."""
+    return remote.parent / f"{remote.name}{SUM}"
+
+
 def send_folder(folder: Path, remote: Remote, pace: Pace | None = None) -> int:
-    """Write the files of a folder, then their checksums. What is there with the same bytes is not sent again.
+    """Write the files of a folder, then their checksums. What is there with the same bytes is not sent again: its
+    checksum was sent, and its size is right.
 
     Returns:
         Bytes that were sent.
@@ -168,11 +196,13 @@ def send_folder(folder: Path, remote: Remote, pace: Pace | None = None) -> int:
     files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != SUMS)
     sums = {p.relative_to(folder).as_posix(): sha256(p) for p in files}
     known = sent_sums(remote)
+    there = {name: size for name, size, _ in objects.listed(remote)} if known else {}
     sent = 0
     for name, digest in sums.items():
-        if known.get(name) != digest:
+        size = (folder / name).stat().st_size
+        if known.get(name) != digest or there.get(name) != size:
             send_file(folder / name, remote / name, pace)
-            sent += (folder / name).stat().st_size
+            sent += size
     if known != sums:
         objects.write(remote / SUMS, sums_text(sums))
     return sent
@@ -184,7 +214,7 @@ def send_file(
     """Write one file; nobody sees it before it is whole.
 
     Raises:
-        StereoSfmError: what arrived has another size, or it cannot be written.
+        StereoSfmError: what arrived has another size, or it cannot be written. InterruptedError: `stopped` became true.
     """
     objects.write(remote, path if pace is None or not pace.bytes_s else pace.pieces(path, stopped))
     size = path.stat().st_size

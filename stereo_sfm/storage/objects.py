@@ -17,10 +17,10 @@ from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import date, timedelta
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.errors import Hindered, StereoSfmError, require
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.storage.remote import Remote
 
@@ -36,6 +36,7 @@ DENIED = re.compile(r"AccessDenied|InvalidAccessKeyId|SignatureDoesNotMatch|^sta
 NO_BUCKET = re.compile(r"NoSuchBucket|ContainerNotFound|The specified bucket does not exist", re.I)
 NO_CREDENTIALS = re.compile(r"credential|service account|account must be specified|169\.254\.169\.254", re.I)
 CREDENTIALS = {"s3": "AWS_ACCESS_KEY_ID", "gs": "GOOGLE_APPLICATION_CREDENTIALS", "az": "AZURE_STORAGE_ACCOUNT_NAME"}
+REFUSED_NAME = re.compile(r'Path "(.*?)"(?: contained empty|: Encountered)', re.DOTALL)
 CODE = re.compile(r"<Code>(\w+)</Code>|^status code: ([45]\d\d [A-Z][A-Za-z ]+)")
 
 
@@ -47,7 +48,15 @@ class Changed(StereoSfmError):
     """Somebody else has written the object meanwhile."""
 
 
-class Unreachable(StereoSfmError):
+class Refused(Hindered):
+    """There is no bucket, no right, no room, or no credentials."""
+
+
+class Denied(Refused):
+    """The credentials give no right to it."""
+
+
+class Unreachable(Hindered):
     """The network or the server failed for longer than `PATIENCE_S`."""
 
 
@@ -56,7 +65,7 @@ _patience_s: ContextVar[float] = ContextVar("patience", default=PATIENCE_S)
 
 @contextmanager
 def patience(seconds: float) -> Generator[None]:
-    """Give up a request after so long, in this thread and block."""
+    """Give up a request after so long, in this thread and block, or sooner where nothing at all arrives."""
     before = _patience_s.set(seconds)
     try:
         yield
@@ -93,7 +102,9 @@ def _store(scheme: str, bucket: str, patience_s: float) -> Any:
             }
         )
     plain = (emulator or os.environ.get("AWS_ENDPOINT_URL", "")).startswith("http://")
-    client = {"connect_timeout": timedelta(seconds=CONNECT_S), "timeout": timedelta(seconds=REQUEST_S)}
+    silent = timedelta(seconds=min(REQUEST_S, patience_s))  # what arrives slowly may take longer
+    client = {"connect_timeout": min(timedelta(seconds=CONNECT_S), silent), "read_timeout": silent}
+    client["timeout"] = timedelta(seconds=REQUEST_S)
     options["client_options"] = {**client, **({"allow_http": True} if plain else {})}
     options["retry_config"] = {
         "max_retries": TRIES,
@@ -113,8 +124,22 @@ def _opened(remote: Remote, doing: str) -> Generator[Any]:
         yield _store(remote.scheme, remote.bucket, _patience_s.get())
     except (obx.AlreadyExistsError, obx.PreconditionError):
         raise Changed(f"{remote} was written by another program meanwhile") from None
+    except InterruptedError:  # not of the network: what was to be written was stopped
+        raise
     except (obx.BaseError, OSError, ValueError) as error:
-        raise _named(remote, doing, error, obx) from None
+        named = _named(remote, doing, error, obx)
+        if doing == "read" and isinstance(named, Denied) and _lacks(remote):
+            named = Missing(f"there is no {remote}")
+        raise named from None
+
+
+def _lacks(remote: Remote) -> bool:
+    """Whether the list of its folder lacks an object. S3 denies what is missing to those who may list a prefix only."""
+    folder = remote.parent
+    with contextlib.suppress(StereoSfmError), _opened(folder, "list") as store:
+        found = store.list_with_delimiter(prefix=folder.key or None)["objects"]
+        return remote.key not in [str(m["path"]) for m in found]
+    return False
 
 
 def _named(remote: Remote, doing: str, error: BaseException, obx: Any) -> StereoSfmError:
@@ -122,19 +147,25 @@ def _named(remote: Remote, doing: str, error: BaseException, obx: Any) -> Stereo
     found = ANSWER.search(said)
     answer = found[0] if found else ""
     if NO_BUCKET.search(answer):
-        return StereoSfmError(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
+        return Refused(f"there is no bucket {remote.scheme}://{remote.bucket}: create it, or correct the name")
     if isinstance(error, FileNotFoundError | obx.NotFoundError):
         return Missing(f"there is no {remote}")
     if FULL.search(answer):  # before the rights: some servers answer 403 to what exceeds a limit
-        return StereoSfmError(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
+        return Refused(f"cannot {doing} {remote}: the storage is full: delete something, or raise its limit")
     denied = (PermissionError, obx.PermissionDeniedError, obx.UnauthenticatedError)
     if isinstance(error, denied) or DENIED.search(answer):
-        return StereoSfmError(
+        return Denied(
             f"no right to {doing} {remote}: check the credentials in the environment, and the rights of this prefix"
         )
     if NO_CREDENTIALS.search(said):
         where = CREDENTIALS.get(remote.scheme, "")
-        return StereoSfmError(f"no credentials for {remote.scheme}://: set them in the environment ({where})")
+        return Refused(f"no credentials for {remote.scheme}://: set them in the environment ({where})")
+    refused = REFUSED_NAME.search(str(error)) if isinstance(error, ValueError | obx.InvalidPathError) else None
+    if refused:
+        return StereoSfmError(
+            f"cannot {doing} {remote}: the object {refused[1]!r} has nothing, dots or odd characters between two"
+            " slashes: give it another name, or delete it"
+        )
     code = CODE.search(answer)
     why = (code[1] or code[2]) if code else "no answer"
     return Unreachable(f"cannot {doing} {remote}: {why}, although it was tried again and again")
@@ -266,7 +297,7 @@ def _exchange_file(remote: Remote, data: bytes, tag: str | None) -> None:
 
 
 def listed(remote: Remote) -> list[tuple[str, int, str]]:
-    """(name below it, bytes, tag) of every object in a folder, by name.
+    """(name below it, bytes, tag) of every object in a folder, by name; no empty ones that stand for a folder.
 
     Raises:
         StereoSfmError: there is no such bucket, or no right to list it.
@@ -274,8 +305,10 @@ def listed(remote: Remote) -> list[tuple[str, int, str]]:
     prefix = f"{remote.key}/" if remote.key else ""
     with _opened(remote, "list") as store:
         found = [m for page in store.list(prefix=prefix or None) for m in page]
-    rows = [(str(m["path"]).removeprefix(prefix), int(m["size"]), str(m["e_tag"])) for m in found]
-    return sorted(row for row in rows if row[0])
+    inside = [m for m in found if str(m["path"]).startswith(prefix)]
+    rows = [(str(m["path"])[len(prefix) :], int(m["size"]), str(m["e_tag"])) for m in inside]
+    above = {str(parent) for name, _, _ in rows for parent in PurePosixPath(name).parents}
+    return sorted(row for row in rows if row[1] or row[0] not in above)
 
 
 def folders(remote: Remote) -> list[str]:

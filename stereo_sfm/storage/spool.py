@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import Pace, cache_root, send_file, sha256
+from stereo_sfm.storage.folders import Pace, cache_root, send_file, sha256, state_root, sum_of, sums_text
 from stereo_sfm.storage.remote import Remote
-
-SUM = ".sha256"  # beside an object: its checksum, as `sha256sum -c` reads it
 
 
 @dataclass(frozen=True)
@@ -31,9 +30,12 @@ class Spool:
             StereoSfmError: there is such an object and `overwrite` is False, the bucket cannot be read, an earlier
                 file for this target has not been sent, or another run has begun one.
         """
-        folder = _root() / hashlib.sha256(str(target).encode()).hexdigest()[:16]
-        folder.mkdir(parents=True, exist_ok=True)
-        spool = Spool.kept(folder / target.name, target)
+        name = hashlib.sha256(str(target).encode()).hexdigest()[:16]
+        file, left = [root / name / target.name for root in _roots()]
+        file.parent.mkdir(parents=True, exist_ok=True)
+        spool = Spool.kept(file, target)
+        if left.is_file() and not file.exists():
+            _take_over(Spool.kept(left, target), file)
         if objects.exists(target) and not overwrite:
             raise StereoSfmError(f"{target} exists: choose another name or use --overwrite")
         if spool.file.exists() and not overwrite:
@@ -51,7 +53,7 @@ class Spool:
             StereoSfmError: another run records or sends it.
         """
         file = file.resolve()
-        spooled = _root() in file.parents
+        spooled = any(root in file.parents for root in _roots())
         remedy = f"choose another name than {target}, or wait until it is sent"
         return Spool(file, target, FolderLock(file.parent, remedy) if spooled else None)
 
@@ -63,9 +65,7 @@ class Spool:
         """
         try:
             send_file(self.file, self.target, pace)
-            objects.write(
-                self.target.parent / f"{self.target.name}{SUM}", f"{sha256(self.file)}  {self.file.name}\n".encode()
-            )
+            objects.write(sum_of(self.target), sums_text({self.target.name: sha256(self.file)}))
         except StereoSfmError as error:
             raise StereoSfmError(
                 f"{error}; it is kept: 'stereo-sfm fleet upload {self.file} {self.target}' sends it"
@@ -74,5 +74,13 @@ class Spool:
             self.file.unlink()
 
 
-def _root() -> Path:
-    return cache_root().resolve() / "spool"
+def _roots() -> tuple[Path, Path]:
+    """Of what waits, and of what earlier versions left in the cache, which may be deleted at any time."""
+    return state_root().resolve() / "spool", cache_root().resolve() / "spool"
+
+
+def _take_over(left: Spool, file: Path) -> None:
+    """Move what an earlier version left: it is whole at its new place, or still at the old one."""
+    part = file.with_name(f".{file.name}.moved")
+    shutil.move(left.file, part)
+    part.replace(file)

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.config import load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval import batch
+from stereo_sfm.jobs import Limits
 
 ROOT = Path(__file__).parents[2]
 SMALL = "sim:aisle?size=212x200&frames=12&rate=15&seed={}"
@@ -89,6 +91,19 @@ def test_without_an_address_no_cluster_is_searched(tmp_path: Path, monkeypatch: 
     with pytest.raises(ConnectionError):
         list(batch.run_batch([task], "10.0.0.1:6379"))
     assert asked == ["10.0.0.1:6379"]
+
+
+def test_a_batch_has_the_limits_of_a_job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked: list[Limits] = []
+
+    def none(jobs: object, limits: Limits, address: str | None, extra: str) -> Iterator[object]:
+        asked.append(limits)
+        return iter(())
+
+    monkeypatch.setattr(batch, "run_jobs", none)
+    task = batch.BatchTask(SMALL.format(1), str(tmp_path / "a"), load(), False)
+    assert not [*batch.run_batch([task]), *batch.run_batch([task], None, Limits(memory_gb=2.0, minutes=5.0))]
+    assert asked == [Limits(), Limits(memory_gb=2.0, minutes=5.0)]
 
 
 LISTENING = """

@@ -1,4 +1,4 @@
-"""An S3 server and small maps."""
+"""An S3 server, a plan and small maps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from stereo_sfm.fleet.plan import Plan, load_plan
+from stereo_sfm.maps.saved_map import save_map
 from tests.fleet.s3_server import BUCKET, KEY, Server, server
+from tests.maps.maps import small_map
 
 
 @pytest.fixture(scope="session")
@@ -41,3 +44,18 @@ def s3(s3_process: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> I
 def place(s3: Server) -> str:
     """An address that no other test uses."""
     return f"s3://{BUCKET}/{next(_numbers)}"
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot's own map of a walk."""
+    folder = tmp_path_factory.mktemp("session") / "map"
+    save_map(small_map()[1], folder)
+    return folder
+
+
+@pytest.fixture
+def plan(place: str, tmp_path: Path) -> Plan:
+    file = tmp_path / "plan.toml"
+    file.write_text(f'[fleet]\nroot = "{place}"\nkeep_images_days = 30\n')
+    return load_plan(file)

@@ -3,7 +3,8 @@
     python -m tests.fleet.s3_server [--seed 1]
 
 prints its port. It adds what moto lacks: conditional puts are atomic (a lock), a part of the answers is 503 (before the
-request is carried out, or after it, so that the answer alone is lost), buckets are full, keys are checked.
+request is carried out, or after it, so that the answer alone is lost), buckets are full, keys are checked, and may be
+limited to a prefix.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from urllib.parse import parse_qsl, urlencode
 
 ROOT = Path(__file__).parents[2]
 KEY, READER = "the-key", "reads-only"  # the second one may not write
+LIMITED = "only-in-"  # a key that begins so, with a prefix whose slashes are dots, has the rights of this prefix
 BUCKET = "fleet"
 FULL = {  # what servers answer where a limit is reached
     "ceph": ("403 Forbidden", "QuotaExceeded"),
@@ -46,8 +48,8 @@ class Faulty:
             self._fail, self._full = float(asked["fail"]), asked.get("full", "")
             return _answer(start, "200 OK", f"{self._sent} {self._written}")
         who = environ.get("HTTP_AUTHORIZATION", "")
-        if f"Credential={KEY}/" not in who and (f"Credential={READER}/" not in who or method not in ("GET", "HEAD")):
-            return _answer(start, "403 Forbidden", "<Error><Code>AccessDenied</Code></Error>")
+        if not _may(environ, who.partition("Credential=")[2].partition("/")[0]):
+            return _answer(start, *DENIED)
         if self._full and (method == "PUT" or (method == "POST" and "uploads" in environ["QUERY_STRING"])):
             status, code = FULL[self._full]
             return _answer(start, status, f"<Error><Code>{code}</Code></Error>")
@@ -63,8 +65,22 @@ class Faulty:
         self._written += int(environ.get("CONTENT_LENGTH") or 0) if method == "PUT" else 0
         if fails:
             return _answer(start, "503 Slow Down", "<Error><Code>SlowDown</Code></Error>")
+        if f"Credential={LIMITED}" in who and answers[0][0].startswith("404"):
+            return _answer(start, *DENIED)  # as S3 does, where not all of the bucket may be listed
         start(*answers[0])
         return [body]
+
+
+DENIED = ("403 Forbidden", "<Error><Code>AccessDenied</Code></Error>")
+
+
+def _may(environ: dict[str, Any], key: str) -> bool:
+    """Whether a key has the right to a request."""
+    if key.startswith(LIMITED):
+        asked = dict(parse_qsl(environ["QUERY_STRING"])).get("prefix", "")
+        _, _, name = environ["PATH_INFO"].removeprefix("/").partition("/")
+        return (name or asked).startswith(f"{key.removeprefix(LIMITED).replace('.', '/')}/")
+    return key == KEY or (key == READER and environ["REQUEST_METHOD"] in ("GET", "HEAD"))
 
 
 def _answer(start: Callable[..., Any], status: str, text: str) -> list[bytes]:

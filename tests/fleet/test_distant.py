@@ -12,6 +12,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.log.whole_file import WholeFile
@@ -139,6 +140,28 @@ def test_an_unsent_recording_stays_until_its_replacement_is_whole(
     assert main(["record", "sim:aisle?size=96x80&frames=3", "-o", str(target), "-q", "--overwrite"]) == 2
     images = describe_file(kept).images
     assert "it is kept" in capsys.readouterr().err and images is not None and images.count == 3
+
+
+def test_an_unsent_recording_is_in_no_cache(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that an earlier version left in the cache is taken over, unless a program of that version writes it."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    target, source = f"{place}/walk.mcap", "sim:aisle?size=96x80&frames=3"
+    spool = Spool.of(Remote.of(target), overwrite=False)
+    kept = spool.file
+    assert tmp_path / "state" in kept.parents
+    del spool
+    left = tmp_path / "cache" / "spool" / kept.parent.name / kept.name
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"not sent yet")
+    with FolderLock(left.parent, "wait"):
+        assert main(["record", source, "-o", target, "-q", "--overwrite"]) == 2
+        assert "another run is writing" in capsys.readouterr().err and left.exists()
+    assert main(["record", source, "-o", target, "-q"]) == 2
+    assert f"{kept} was recorded for" in capsys.readouterr().err and not left.exists()
+    assert main(["fleet", "upload", str(kept), target]) == 0
+    assert objects.read(Remote.of(target)) == b"not sent yet"
 
 
 def _unreachable() -> None:

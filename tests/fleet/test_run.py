@@ -25,18 +25,36 @@ from tests.maps.maps import small_map
 ROOT = Path(__file__).parents[2]
 
 
+def in_turn(jobs: Sequence[Job], limits: Limits, address: str | None, extra: str) -> Iterator[tuple[Job, Result]]:
+    """The jobs one after the other in this process."""
+    results: dict[str, Result] = {}
+    for job in jobs:
+        before = {name: results[name] for name in job.after}
+        results[job.name] = _within(job.work, job.args, before, limits)
+        yield job, results[job.name]
+
+
+def test_a_store_with_an_odd_name_fails_alone(
+    place: str, s3: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(run, "run_jobs", in_turn)
+    save_map(small_map()[1], tmp_path / "map")
+    root = Remote.of(place)
+    send_folder(tmp_path / "map", root / "b" / "walks" / "r1" / "2026-11-25_2200")
+    objects.write(root / "b" / "walks" / "r1" / "2026-11-25.bag", b"a bag")
+    s3.request("PUT", f"/{root.bucket}/{root.key}/a/walks/r1//2026-11-25.mcap")
+    plan = tmp_path / "plan.toml"
+    plan.write_text(f'[fleet]\nroot = "{place}"\nkeep_images_days = 30\n[job]\nmemory_gb = 0.0\n')
+    assert main(["fleet", "run", str(plan)]) == 3
+    said = capsys.readouterr().err
+    assert f"a: cannot list {place}/a/walks: the object '{root.key}/a/walks/r1//2026-11-25.mcap' has nothing" in said
+    assert "b 2026-11-25: ok, version 1" in said and f"{place}/b/walks/r1/2026-11-25.bag" in said
+
+
 def test_what_failed_is_named_and_what_is_done_is_not_repeated(
     place: str, s3: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The command, its jobs one after the other in this process."""
-
-    def in_turn(jobs: Sequence[Job], limits: Limits, address: str | None, extra: str) -> Iterator[tuple[Job, Result]]:
-        results: dict[str, Result] = {}
-        for job in jobs:
-            before = {name: results[name] for name in job.after}
-            results[job.name] = _within(job.work, job.args, before, limits)
-            yield job, results[job.name]
-
     monkeypatch.setattr(run, "run_jobs", in_turn)
     save_map(small_map()[1], tmp_path / "map")
     send_folder(tmp_path / "map", Remote.of(place) / "a" / "walks" / "r1" / "2026-11-25_2200")

@@ -62,7 +62,9 @@ def test_recordings_arrive_whole_after_a_night_offline(place: str, s3: Server, t
             s3.faults(0.0)
             wait_for(lambda: not first.poses.exists() and used_bytes(folder) < 1e9 * QUOTA_GB, service)
             newest = segments(recording)[-1]
-            wait_for(lambda: segments(recording)[-1] != newest and newest.sent and newest.images.is_file(), service)
+            wait_for(
+                lambda: segments(recording)[-1] != newest and not newest.unsent() and newest.images.is_file(), service
+            )
             service.send_signal(signal.SIGTERM)
             assert service.wait(PATIENCE_S) == 0
         finally:

@@ -21,49 +21,18 @@ from stereo_sfm.fleet.catalogue import ask, opened
 from stereo_sfm.fleet.copies import fetch_version
 from stereo_sfm.fleet.editing import checked_out
 from stereo_sfm.fleet.plan import Plan, Walk, find_walks, load_plan, night_of
-from stereo_sfm.fleet.run import forget_images, forget_versions, jobs_of
+from stereo_sfm.fleet.run import forget_images, forget_versions
 from stereo_sfm.fleet.steps import update_store
 from stereo_sfm.fleet.versions import current, numbered, roll_back
 from stereo_sfm.fleet.work_folder import work_folder
-from stereo_sfm.jobs import Job, Result
 from stereo_sfm.maps import put_session as put_session_module
 from stereo_sfm.maps.put_session import put_session
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.folders import send_folder
 from stereo_sfm.storage.remote import Remote
+from tests.fleet.nights import STORE, carry_out, walks
 from tests.maps.maps import same, small_map
-
-STORE = "017"
-
-
-@pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A robot's own map of a walk."""
-    folder = tmp_path_factory.mktemp("session") / "map"
-    save_map(small_map()[1], folder)
-    return folder
-
-
-@pytest.fixture
-def plan(place: str, tmp_path: Path) -> Plan:
-    file = tmp_path / "plan.toml"
-    file.write_text(f'[fleet]\nroot = "{place}"\nkeep_images_days = 30\n')
-    return load_plan(file)
-
-
-def carry_out(plan: Plan, only: int | None = None) -> dict[str, Result]:
-    """The jobs in their order; `only` so many of them, as if then everything were killed."""
-    results: dict[str, Result] = {}
-    jobs: list[Job] = jobs_of(plan, find_walks(plan)[0])
-    for job in jobs[:only]:
-        before = {name: results[name] for name in job.after}
-        results[job.name] = job.work(*job.args, before) if before else job.work(*job.args)
-    return results
-
-
-def walks(plan: Plan) -> Remote:
-    return plan.root / STORE / "walks"
 
 
 def test_a_night_is_done_once(plan: Plan, session: Path, tmp_path: Path) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import socket
+import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -9,8 +12,10 @@ import pytest
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.saved_map import save_map
+from stereo_sfm.recording.segments import Segment, new_recording
+from stereo_sfm.recording.upload import Uploader
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_folder
+from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_file, send_folder, sum_of
 from stereo_sfm.storage.objects import Missing, Unreachable
 from stereo_sfm.storage.remote import Remote, place
 from stereo_sfm.storage.stream import PAGE, RangeStream
@@ -65,6 +70,42 @@ def test_the_name_of_an_object_says_nothing_about_its_server(name: str, monkeypa
     with objects.patience(1.0), pytest.raises(Unreachable, match="no answer"):
         objects.read(Remote.of(f"s3://bucket/{name}"))
     objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_server_that_never_answers_costs_the_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes the connection, and holds it."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        for key, value in (("ENDPOINT_URL", url), ("ACCESS_KEY_ID", "a"), ("SECRET_ACCESS_KEY", "b")):
+            monkeypatch.setenv(f"AWS_{key}", value)
+        objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+        begin = time.monotonic()
+        with objects.patience(1.0), pytest.raises(Unreachable, match="no answer"):
+            objects.read(Remote.of("s3://bucket/x"))
+        assert time.monotonic() - begin < 20.0
+    objects._store.cache_clear()  # pyright: ignore[reportPrivateUsage]
+
+
+@pytest.mark.parametrize("name", ["a//x.mcap", "a/%2E%2E/x.mcap"])
+def test_a_name_of_another_program_is_named(name: str, place: str, s3: Server) -> None:
+    s3.request("PUT", f"/{Remote.of(place).bucket}/{Remote.of(place).key}/{name}")
+    with pytest.raises(StereoSfmError, match="give it another name") as error:
+        objects.listed(Remote.of(place))
+    assert f"{Remote.of(place).key}/{name.replace('%2E', '.')}" in str(error.value)
+    assert not isinstance(error.value, Unreachable)
+
+
+def test_what_is_stopped_is_no_failure_of_the_network(place: str, tmp_path: Path) -> None:
+    segment = Segment.of(new_recording(tmp_path, "sim:aisle", "full", datetime(2026, 11, 25, 22)), 0, 0)
+    segment.poses.write_bytes(bytes(10_000_000))
+    with pytest.raises(InterruptedError):
+        send_file(segment.poses, Remote.of(place) / "x", Pace(1e6), lambda: True)
+    assert not objects.exists(Remote.of(place) / "x")
+    uploader = Uploader(tmp_path, Remote.of(place), 1e6)
+    uploader.start()
+    time.sleep(0.5)
+    uploader.close()
+    assert uploader.problem == "" and not objects.exists(Remote.of(place) / segment.folder.name / segment.poses.name)
 
 
 def test_missing_credentials_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,10 +186,34 @@ def test_a_truncated_upload_is_found(place: str, tmp_path: Path) -> None:
     assert SUMS in [name for name, _, _ in objects.listed(target)]
 
 
+def test_a_folder_sent_again_mends_a_truncated_upload(place: str, tmp_path: Path) -> None:
+    (tmp_path / "f").mkdir()
+    for name in ("a", "b", "c"):
+        (tmp_path / "f" / name).write_bytes(name.encode() * 1000)
+    target = Remote.of(place) / "f"
+    send_folder(tmp_path / "f", target)
+    objects.write(target / "a", b"a" * 500)
+    objects.delete([target / "b"])
+    assert send_folder(tmp_path / "f", target) == 2000 and send_folder(tmp_path / "f", target) == 0
+    assert (fetch(target) / "a").read_bytes() == b"a" * 1000
+
+
+def test_a_single_file_is_checked_as_well(place: str, tmp_path: Path) -> None:
+    (tmp_path / "here.mcap").write_bytes(b"1" * 1000)
+    target = Remote.of(place) / "there.mcap"
+    assert main(["fleet", "upload", str(tmp_path / "here.mcap"), str(target)]) == 0
+    assert objects.read(sum_of(target)).endswith(b"  there.mcap\n")  # the name that `sha256sum -c` finds
+    assert fetch(target).read_bytes() == b"1" * 1000
+    for damaged in (b"1" * 500, b"2" * 1000):
+        objects.write(target, damaged)
+        with pytest.raises(StereoSfmError, match=r"there\.mcap is not what was sent"):
+            fetch(target)
+    objects.delete([sum_of(target)])  # of another program
+    assert fetch(target).read_bytes() == b"2" * 1000
+
+
 def test_a_pace_is_kept(tmp_path: Path) -> None:
     (tmp_path / "x").write_bytes(b"0" * 30_000)
-    import time
-
     begin = time.monotonic()
     assert sum(len(piece) for piece in Pace(100_000).pieces(tmp_path / "x")) == 30_000
     assert time.monotonic() - begin > 0.15

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import re
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from stereo_sfm.arrays import write_arrays
+from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.fleet import copies
 from stereo_sfm.fleet.copies import fetch_released, fetch_version, version_of
@@ -27,6 +31,7 @@ from stereo_sfm.fleet.versions import (
     released,
     roll_back,
 )
+from stereo_sfm.maps.store import lock
 from stereo_sfm.storage import objects
 from stereo_sfm.storage.objects import Changed, Unreachable
 from stereo_sfm.storage.remote import Remote
@@ -86,6 +91,38 @@ def test_a_folder_of_another_store_becomes_this_one(place: str, tmp_path: Path) 
     publish_night(store, tmp_path / "anew", 2)
     fetch_released(store, "", robot)
     assert content(robot) == content(tmp_path / "anew")
+
+
+def test_a_map_of_no_store_is_not_replaced(place: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store, mine = Remote.of(place), tmp_path / "mine"
+    publish_night(store, tmp_path / "made", 0)
+    write_night(mine, 1)
+    before = content(mine)
+    assert main(["map", "fetch", place, str(mine)]) == StereoSfmError.exit_code
+    said = capsys.readouterr().err.strip()
+    assert "of another map: choose another folder" in said and len(said.splitlines()) == 1
+    with pytest.raises(StereoSfmError, match="of another map"):  # at the start of a service
+        fetch_released(store, "", mine)
+    assert content(mine) == before
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("stays")
+    assert main(["map", "fetch", place, str(tmp_path / "notes")]) == 0
+    assert content(tmp_path / "notes").keys() == {*content(tmp_path / "made"), "mine.txt"}
+
+
+def test_two_programs_write_no_map_at_once(place: str, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A robot is given a map while a person fetches it."""
+    store, robot = Remote.of(place), tmp_path / "robot"
+    publish_night(store, tmp_path / "made", 0)
+    fetch_released(store, "", robot)
+    publish_night(store, tmp_path / "made", 1)
+    with lock(robot):
+        with pytest.raises(StereoSfmError, match="another run is writing to"):
+            fetch_version(store, current(store), robot)
+        fetch_released(store, "", robot)
+        assert "stays version 1" in caplog.text and version_of(robot)[1] == 1
+    fetch_released(store, "", robot)
+    assert version_of(robot)[1] == 2
 
 
 def test_a_second_writer_is_refused_and_writes_nothing(place: str, tmp_path: Path) -> None:
@@ -162,6 +199,69 @@ def test_robots_that_were_given_a_version_lose_it_when_it_is_rolled_back(place: 
     assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [1, 1, 1]
     publish_night(store, tmp_path / "made", 2)
     assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [3, 1, 3]
+
+
+def answer_lost(monkeypatch: pytest.MonkeyPatch, meanwhile: Callable[[], object]) -> None:
+    """The next exchange is carried out, its answer lost; something else happens before it is tried again."""
+    exchange = objects.exchange
+
+    def lost(remote: Remote, data: bytes, tag: str | None) -> None:
+        monkeypatch.setattr(objects, "exchange", exchange)
+        exchange(remote, data, tag)
+        meanwhile()
+        exchange(remote, data, tag)
+
+    monkeypatch.setattr(objects, "exchange", lost)
+
+
+def test_a_version_whose_answer_was_lost_is_the_parent_of_the_next(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Remote.of(place)
+    publish_night(store, tmp_path / "made", 0)
+    answer_lost(monkeypatch, lambda: publish_night(store, tmp_path / "other", 2))
+    publish_night(store, tmp_path / "made", 1)
+    assert [v.number for v in history(store)] == [3, 2, 1]
+    assert current(store).sessions.keys() == {"session0", "session1", "session2"}
+    fetch_version(store, numbered(store, 2), tmp_path / "robot")
+    assert content(tmp_path / "robot") == content(tmp_path / "made")
+    assert roll_back(store).number == 2
+
+
+def test_a_rollback_whose_answer_was_lost_is_not_done_twice(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Remote.of(place)
+    for night in (0, 1):
+        publish_night(store, tmp_path / "made", night)
+    answer_lost(monkeypatch, lambda: publish_night(store, tmp_path / "other", 2))
+    assert roll_back(store).number == 1 and [v.number for v in history(store)] == [3, 1]
+
+
+def test_a_rollback_that_is_killed_has_reached_the_robots(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed after its first write."""
+    store, exchange = Remote.of(place), objects.exchange
+    for night in (0, 1):
+        publish_night(store, tmp_path / "made", night)
+    release(store, 1)
+    release(store, 2, ("r7",))
+
+    def killed(remote: Remote, data: bytes, tag: str | None) -> None:
+        exchange(remote, data, tag)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(objects, "exchange", killed)
+    with pytest.raises(KeyboardInterrupt):
+        roll_back(store)
+    monkeypatch.setattr(objects, "exchange", exchange)
+    assert current(store).number == released(store, "r7").number == 1
+    with pytest.raises(StereoSfmError, match=r"version 2 of .* was rolled back"):
+        release(store, 2, ("r8",))
+    publish_night(store, tmp_path / "made", 2)
+    release(store, 3, ("r8",))
+    assert [released(store, robot).number for robot in ("r1", "r7", "r8")] == [1, 1, 3]
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", ""])
@@ -250,8 +350,6 @@ def test_a_store_of_before_has_one_folder_of_files(place: str, tmp_path: Path) -
 def test_without_a_network_a_robot_keeps_its_version(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from stereo_sfm.cli import main
-
     publish_night(Remote.of(place), tmp_path / "made", 0)
     assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
     before = content(tmp_path / "robot")
@@ -263,6 +361,26 @@ def test_without_a_network_a_robot_keeps_its_version(
     assert main(["map", "fetch", place, str(tmp_path / "robot")]) == 0
     assert "stays version 1" in capsys.readouterr().err and content(tmp_path / "robot") == before
     assert main(["map", "fetch", place, str(tmp_path / "other")]) == StereoSfmError.exit_code
+
+
+@pytest.mark.parametrize("full", ["disk", "memory"])
+def test_without_room_a_robot_keeps_its_version(
+    full: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    store, robot = Remote.of(place), tmp_path / "robot"
+    publish_night(store, tmp_path / "made", 0)
+    fetch_released(store, "", robot)
+    before = content(robot)
+    publish_night(store, tmp_path / "made", 1)
+
+    def no_room(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device") if full == "disk" else MemoryError
+
+    monkeypatch.setattr(*((Path, "write_bytes") if full == "disk" else (zstandard, "ZstdDecompressor")), no_room)
+    with pytest.raises(OSError if full == "disk" else MemoryError):  # nothing is damaged
+        fetch_released(store, "", tmp_path / "other")
+    fetch_released(store, "", robot)
+    assert "stays version 1" in caplog.text and content(robot) == before
 
 
 def test_without_a_network_a_map_is_read_as_it_was_fetched_last(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +15,8 @@ from stereo_sfm.recording import upload
 from stereo_sfm.recording.quota import Disk, Quota, make_room
 from stereo_sfm.recording.segments import RECORDING, SENT, Segment, new_recording, recordings, sent_whole
 from stereo_sfm.recording.upload import Uploader
+from stereo_sfm.service.config import RecordingConfig
+from stereo_sfm.service.recorder import policy_of
 from stereo_sfm.storage.objects import Unreachable
 from stereo_sfm.storage.remote import Remote
 
@@ -120,3 +124,46 @@ def test_a_black_box_sends_marked_images_alone(tmp_path: Path, bucket: Bucket) -
     segments[1].mark("look")
     Uploader(tmp_path, TO, black_box=True).send_all()
     assert [name for name in bucket.sent if name.endswith(".images.mcap")] == [segments[1].images.name]
+
+
+def test_a_black_box_keeps_what_is_marked_until_it_is_sent(tmp_path: Path, bucket: Bucket) -> None:
+    """Images of unmarked segments make room; what is to be sent stays, also what the service marked itself."""
+    config = RecordingConfig(folder=str(tmp_path), upload=str(TO), quota_gb=2000e-9, min_free_gb=0.0)
+    quota = policy_of(config, "black_box").quota
+    segments = recorded(tmp_path, 4)
+    segments[0].mark("lost: tracking")
+    segments[2].mark("lost: tracking")
+    assert make_room(tmp_path, quota, None, lambda _: Disk(10**9, 10**9)) > 0
+    assert [segment.images.exists() for segment in segments] == [True, False, True, False]
+    assert all(segment.poses.exists() for segment in segments)
+    Uploader(tmp_path, TO, black_box=True).send_all()
+    assert make_room(tmp_path, quota, None, lambda _: Disk(10**9, 10**9)) == 0
+    assert [segment.images.exists() for segment in segments] == [False, False, True, False]
+    assert sum(name.endswith(".images.mcap") for name in bucket.held) == 2
+
+
+def test_on_a_full_disk_what_is_sent_makes_room(
+    tmp_path: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its line in SHA256SUMS does not fit, or the beginning of it alone."""
+    segments, opened = [segment for _ in range(2) for segment in recorded(tmp_path)], Path.open
+
+    def full(path: Path, mode: str = "r", *args: Any, **options: Any) -> Any:
+        if path.name == SENT and mode != "rb":
+            with opened(path, mode, *args, **options) as stream:
+                stream.write(b"0123" if "b" in mode else "0123")
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return opened(path, mode, *args, **options)
+
+    current = segments[-1]
+    monkeypatch.setattr(Path, "open", full)
+    for sent in (10, 0):  # by another one, too: the settings were changed
+        assert Uploader(tmp_path, TO, current=lambda: current).send_all() == sent
+    assert len(bucket.sent) == len(bucket.held) == 10 + 2
+    assert make_room(tmp_path, Quota(bytes=2100, sent_only=True), current, lambda _: Disk(10**9, 10**9)) == 0
+    assert not segments[0].folder.exists() and current.images.exists()
+    monkeypatch.setattr(Path, "open", opened)
+    assert Uploader(tmp_path, TO).send_all() == 2 and len(bucket.sent) == len(bucket.held) == 2 * (6 + 2)
+    lines = (current.folder / SENT).read_bytes()
+    assert sent_whole(current.folder) and bucket.held[f"{TO}/{current.folder.name}/{SENT}"] + b"# complete\n" == lines
+    assert len(lines.splitlines()) == 6 + 1 and b"0123" not in [line[:4] for line in lines.splitlines()]

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.input_file import open_regular
 from stereo_sfm.service.outputs.settings import SecurityConfig
+from stereo_sfm.storage.folders import state_root
 
 if TYPE_CHECKING:
     from stereo_sfm.service.config import RobotConfig
@@ -261,7 +262,7 @@ def page_link(config: RobotConfig) -> str:
 def _state() -> Path | None:
     """The folder for the state of this user; None: it has no home folder."""
     with contextlib.suppress(RuntimeError):
-        return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stereo-sfm"
+        return state_root()
     return None
 
 
