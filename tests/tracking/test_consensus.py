@@ -125,22 +125,6 @@ def test_points_that_agree_with_both_motions_are_no_evidence_of_rest(seed: int) 
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_start_in_a_turn_is_no_moving_object(seed: int) -> None:
-    """The first images are blurred, with six times the noise that is assumed: their noise is learned from few."""
-    rng = np.random.default_rng(seed)
-    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
-    solution = None
-    for _ in range(6):
-        tracks = scene(rng)[0]
-        before = rng.uniform([-2.0, -1.2, 2.0], [2.0, 1.2, 4.0], (len(tracks), 3))
-        put(rng, tracks, before, se3.transform(se3.inverse(MOVED), before), 1.8)
-        tracks.age = np.full(len(tracks), 2, np.int32)
-        solution = solver.solve(tracks, ExpectedMotion(MOVED, np.zeros(6), SECONDS), np.eye(4), before=len(tracks))
-        solver.learn(tracks, solution, ExpectedMotion(MOVED, np.zeros(6), SECONDS))
-    assert solution is not None and solution.inlier.mean() > 0.9 and not solution.moving.any()
-
-
-@pytest.mark.parametrize("seed", range(5))
 def test_a_start_in_traffic_is_no_rest(seed: int) -> None:
     """A car drives, points are far, another comes towards it: rest is a prediction without evidence."""
     rng, driven = np.random.default_rng(seed), se3.exp(np.array([0.0, 0.0, 0.6, 0.0, 0.002, 0.0]))

@@ -132,7 +132,7 @@ class FramePoseSolver:
     def __init__(self, config: TrackerConfig, cameras: StereoCameras, shutter: RollingShutter) -> None:
         self.cameras = cameras  # current ones
         self._config, self._shutter = config, shutter
-        self._noise, self._noises = 1.0, 1  # observed noise over config.sigma_px, of how many frames: the first assumed
+        self._noise = 1.0  # observed noise over config.sigma_px
         self._alert_s = 0.0  # seconds for which other motions are still searched for
         self.open_view = 0.0  # inliers of an unobstructed view
         self._difference = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
@@ -413,17 +413,14 @@ class FramePoseSolver:
     def _learn_noise(self, tracks: Tracks, solution: PoseSolution, seconds: float) -> None:
         """From the points that have been static for long, outliers or not: what they show is noise.
 
-        While none is known for so long, from the inliers, unless objects move. The first frames are averaged, where
-        they show more noise than is assumed: less says little of points that are young.
+        While none is known for so long, from the inliers, unless objects move.
         """
         surely_static = ~tracks.moving & (tracks.age * seconds >= SURE_S) & np.isfinite(solution.error)
         if np.count_nonzero(surely_static) < 2 * self._config.min_features:
             surely_static = solution.inlier
             if self.alert or not surely_static.any():
                 return
-        self._noises += 1
-        more = median(solution.error[surely_static]) / MEDIAN_ERROR - 1.0
-        noise = self._noise * (1.0 + more * (max(0.1, 1.0 / self._noises) if more > 0 else 0.1))
+        noise = self._noise * (0.9 + 0.1 * median(solution.error[surely_static]) / MEDIAN_ERROR)
         self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
 
     def forget(self) -> None:
