@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import argparse
 import atexit
-import contextlib
 import importlib
 import io
 import logging
 import os
 import select
 import sys
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import NoReturn
 
 from stereo_sfm.commands._stop import INTERRUPTED
 from stereo_sfm.errors import StereoSfmError, did_you_mean, from_os_error
-
-if TYPE_CHECKING:
-    from stereo_sfm.storage.working_copy import WorkingCopy
 
 # subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
 COMMANDS: dict[str, str] = {
@@ -141,11 +137,12 @@ def _output_closed() -> bool:
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in reader.poll(0))
 
 
-def _fetched(value: object, copies: list[WorkingCopy]) -> object:
-    """An argument; of what is in a bucket a copy. `copies`: those that a command may change are added.
+def _fetched(value: object) -> object:
+    """An argument; what a command reads as a copy, where it is in a bucket.
 
     Raises:
-        StereoSfmError: it cannot be fetched, or is a pipe, which would hold up who opens it.
+        StereoSfmError: it cannot be fetched, or is not what a command reads: the folder `s3:` would be made of it. It
+            is a pipe, which would hold up who opens it.
     """
     if not isinstance(value, Path):
         return value
@@ -157,31 +154,10 @@ def _fetched(value: object, copies: list[WorkingCopy]) -> object:
         refuse_pipe(found)
         return found
     if not isinstance(value, InputPath):
-        from stereo_sfm.storage.working_copy import WorkingCopy
-
-        copies.append(WorkingCopy.of(found))
-        return copies[-1].path
+        raise StereoSfmError(f"{found} cannot be here, only a path ('stereo-sfm fleet upload' sends a folder)")
     from stereo_sfm.fleet.copies import fetched
 
     return fetched(found)
-
-
-def _fetch(arguments: dict[str, object], copies: list[WorkingCopy]) -> None:
-    """Replace what is in a bucket, see `_fetched`."""
-    for name, value in arguments.items():
-        several = [_fetched(v, copies) for v in value] if isinstance(value, list) else None
-        arguments[name] = _fetched(value, copies) if several is None else several
-
-
-@contextlib.contextmanager
-def _sent(copies: list[WorkingCopy], quiet: bool) -> Generator[None]:
-    """What has changed is sent at the end, also after an error."""
-    try:
-        yield
-    finally:
-        for copy in copies:
-            if copy.send() and not quiet:
-                print(f"sent to {copy.remote}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -196,7 +172,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _build_parser(chosen)
     options = parser.parse_args(args)
     _start_logging(options)
-    copies: list[WorkingCopy] = []
     try:
         if options.print_versions:
             _print_versions()
@@ -204,18 +179,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.command is None:
             parser.print_help()
             return 0
-        _fetch(vars(options), copies)
+        for name, value in vars(options).items():
+            setattr(options, name, [*map(_fetched, value)] if isinstance(value, list) else _fetched(value))
         command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
-        with _sent(copies, getattr(options, "quiet", False)):
-            code = command.run(options)
+        code = command.run(options)
         if argv is None and options.command == "serve":
             _leave(code)
         return code
     except StereoSfmError as error:
-        said = str(error)
-        for copy in copies:
-            said = said if copy.path.parent.exists() else said.replace(str(copy.path), str(copy.remote))
-        print(f"stereo-sfm {options.command}: {said}", file=sys.stderr)
+        print(f"stereo-sfm {options.command}: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
         if not _output_closed():

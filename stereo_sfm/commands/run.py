@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--localize-only", action="store_true", help="localize the camera in --map-in without changing the map"
     )
-    parser.add_argument("--map-out", type=Path, metavar="DIR", help="save the map (merged with --map-in, if given)")
+    parser.add_argument("--map-out", metavar="DIR", help="save the map (merged with --map-in, if given)")
     parser.add_argument(
         "--frame", choices=("cam0", "body"), default="cam0", help="frame whose poses the trajectories contain"
     )
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.storage.remote import Remote, place
 
     target = None if args.output is None else place(args.output)
-    folders = MapFolders(_map_to_read(args.map_in), args.localize_only, args.map_out)
+    folders = MapFolders(_map_to_read(args.map_in), args.localize_only, _map_to_write(args.map_out))
     folders.check(args.overwrite)
     if isinstance(target, Remote) and objects.listed(target) and not args.overwrite:  # or there is no such bucket
         raise StereoSfmError(f"{target} exists: choose another -o, or add --overwrite")
@@ -128,4 +128,18 @@ def _map_to_read(name: str | None) -> Path | None:
         from stereo_sfm.fleet.copies import fetched_map
 
         return fetched_map(found)
+    return found
+
+
+def _map_to_write(name: str | None) -> Path | None:
+    """The folder of `--map-out`.
+
+    Raises:
+        StereoSfmError: it is in a bucket.
+    """
+    from stereo_sfm.storage.remote import Remote, place
+
+    found = None if name is None else place(name)
+    if isinstance(found, Remote):
+        raise StereoSfmError(f"--map-out is a folder here; 'stereo-sfm map update {found} RUN' changes that store")
     return found

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import tempfile
 from pathlib import Path
 
 import pytest
@@ -16,8 +15,8 @@ from stereo_sfm.fleet.editing import checked_out, session_id
 from stereo_sfm.fleet.versions import current, released
 from stereo_sfm.maps.put_session import put_session
 from stereo_sfm.maps.saved_map import load_map, save_map
-from stereo_sfm.storage import objects, working_copy
-from stereo_sfm.storage.folders import SUMS, send_folder
+from stereo_sfm.storage import objects
+from stereo_sfm.storage.folders import send_folder
 from stereo_sfm.storage.remote import Remote
 from tests.maps.maps import small_map
 
@@ -95,55 +94,6 @@ def test_truth_and_export_by_address(place: str, tmp_path: Path, monkeypatch: py
     monkeypatch.chdir(tmp_path)
     assert main(["export", f"{place}/run", "--format", "kitti"]) == 0
     assert (tmp_path / "export_map.kitti").is_file()
-
-
-def test_what_a_command_writes_is_sent(saved: Path, place: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """It is made here, and a command knows what is there."""
-    prune = ["map", "prune", str(saved), "-o", f"{place}/pruned"]
-    assert main(prune) == 0
-    assert f"sent to {place}/pruned" in capsys.readouterr().out
-    assert main(["map", "info", f"{place}/pruned"]) == 0
-    assert main(prune) == 2
-    assert f"{place}/pruned holds a map" in capsys.readouterr().err
-    assert main([*prune, "--overwrite"]) == 0
-    assert main(["export", str(saved), "--format", "ply", "-o", f"{place}/points.ply"]) == 0
-    assert objects.read(Remote.of(f"{place}/points.ply")).startswith(b"ply")
-    assert not list(Path(tempfile.gettempdir()).glob("stereo-sfm-*/points.ply"))
-
-
-def test_what_a_command_removes_is_removed(place: str) -> None:
-    folder = Remote.of(place) / "folder"
-    for name in ("old", "kept"):
-        objects.write(folder / name, name.encode())
-    copy = working_copy.WorkingCopy.of(folder)
-    (copy.path / "old").unlink()
-    (copy.path / "new").write_bytes(b"new")
-    assert copy.send() and {name for name, _, _ in objects.listed(folder)} == {"kept", "new", SUMS}
-    assert not working_copy.WorkingCopy.of(folder).send() and not copy.path.exists()
-
-
-def test_a_store_is_no_output(saved: Path, place: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["map", "update", place, str(saved)]) == 0
-    assert main(["map", "prune", str(saved), "-o", place, "--overwrite"]) == 2
-    assert "is a store with versions" in capsys.readouterr().err and current(Remote.of(place)).number == 1
-
-
-def test_what_cannot_be_sent_is_kept(
-    saved: Path, place: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def away(*_: object) -> int:
-        raise objects.Unreachable("no network")
-
-    monkeypatch.setattr(working_copy, "send_folder", away)
-    assert main(["map", "prune", str(saved), "-o", f"{place}/pruned"]) == 2
-    said = capsys.readouterr().err
-    kept = Path(said.strip().rpartition("is kept in ")[2])
-    assert "no network" in said and load_map(kept).snapshot.kf_ids.size
-
-
-def test_a_run_saves_its_map_in_a_bucket(place: str, tmp_path: Path) -> None:
-    assert main(["run", "sim:loop?frames=20", "-o", str(tmp_path / "run"), "-q", "--map-out", f"{place}/map"]) == 0
-    assert main(["map", "info", f"{place}/map"]) == 0
 
 
 @pytest.mark.parametrize("source", ["s3://KEY:SECRET@b/x.mcap", "mcap:s3://KEY:SECRET@b/x.mcap"])
