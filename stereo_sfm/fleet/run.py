@@ -73,8 +73,8 @@ def forget_images(plan: Plan, walks: list[Walk], today: datetime.date, waiting: 
 
 
 def _forget_others(plan: Plan, place: Remote, today: datetime.date) -> int:
-    """Delete what is old and no walk."""
-    return _delete(place) if _age(night_of(place.name), place, today) > plan.fleet.keep_images_days else 0
+    """Delete what is old and no walk. What is dated long ago may be arriving now."""
+    return _delete(place) if _age(UNDATED, place, today) > plan.fleet.keep_images_days else 0
 
 
 def _forget_walks(plan: Plan, walks: list[Walk], today: datetime.date) -> int:
@@ -147,9 +147,11 @@ def _delete(place: Remote) -> int:
     if files:
         objects.delete(place / name for name, _, _ in files)
         return sum(size for _, size, _ in files)
-    size = objects.size_and_tag(place)[0]
-    objects.delete([place, place.parent / f"{place.name}{SUM}"])
-    return size
+    with contextlib.suppress(objects.Missing):  # somebody else was first
+        size = objects.size_and_tag(place)[0]
+        objects.delete([place, place.parent / f"{place.name}{SUM}"])
+        return size
+    return 0
 
 
 def _age(night: str, place: Remote, today: datetime.date) -> int:

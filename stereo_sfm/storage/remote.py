@@ -42,8 +42,6 @@ class Remote:
         bucket, _, key = rest.partition("/")
         if "@" in bucket:
             raise StereoSfmError(f"{scheme}:// takes no credentials in an address: set them in the environment")
-        if "?" in key:
-            raise StereoSfmError(f"{scheme}://{bucket}/...: an address has no '?', and signatures have no place in it")
         if scheme == "file":
             if bucket not in ("", "localhost"):
                 raise StereoSfmError(f"file://{rest}: a path on this computer begins with three slashes: file:///PATH")
@@ -114,5 +112,9 @@ def place(text: str) -> Place:
         raise StereoSfmError("an empty text names no folder: write . for this one")
     if not is_uri(text):
         return Path(text)
+    if "?" in text:  # in what somebody writes it begins a signature; an object may have it in its name
+        raise StereoSfmError(
+            f"{text.partition(':')[0]}://...: an address has no '?', and signatures have no place in it"
+        )
     found = Remote.of(text)
     return Path("/") / found.key if found.scheme == "file" else found

@@ -89,6 +89,17 @@ def test_no_store_that_can_be_listed_is_one_line(plan: Plan, s3: Server, monkeyp
         find_walks(plan)
 
 
+def test_what_arrives_late_or_has_an_odd_name_is_not_deleted(plan: Plan, s3: Server) -> None:
+    """A robot was away for months; its folder is no whole walk yet."""
+    late = walks(plan) / "r1" / "2025-01-05_2200"
+    objects.write(late / "segment.mcap", b"images")
+    objects.write(walks(plan) / "r1" / "what?.txt", b"a question")
+    _, waiting = find_walks(plan)
+    assert len(waiting) == 2 and forget_images(plan, [], datetime.date.today(), waiting) == 0
+    assert objects.exists(late / "segment.mcap")
+    assert forget_images(plan, [], datetime.date(2099, 1, 1), waiting) == 16
+
+
 def test_a_marker_of_a_folder_hides_no_walk(plan: Plan, session: Path, s3: Server) -> None:
     send_folder(session, walks(plan) / "r1" / f"{NIGHT}_2200")
     for key in ("", "r1/", f"r1/{NIGHT}_2200/", "r2/"):  # the last one is an empty folder
