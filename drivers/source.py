@@ -242,10 +242,10 @@ def _split(text: str) -> tuple[str, str, str]:
     kind = _kind(text)
     if kind is not None:
         named = head.partition(":")[2]
-        return kind, _near(named) if is_uri(named) and registry.driver(kind).cameras is None else named, query
+        return kind, local_place(named) if is_uri(named) and registry.driver(kind).cameras is None else named, query
     if is_uri(head):
-        near = _near(head)
-        return (registry.recognise(Path(near)), near, query) if not is_uri(near) else ("mcap", near, query)
+        found = local_place(head)
+        return (registry.recognise(Path(found)), found, query) if not is_uri(found) else ("mcap", found, query)
     if Path(text).expanduser().exists():
         head, query = text, ""
     path = Path(head).expanduser()
@@ -254,7 +254,7 @@ def _split(text: str) -> tuple[str, str, str]:
     return registry.recognise(path), str(path), query
 
 
-def _near(uri: str) -> str:
+def local_place(uri: str) -> str:
     """Where a source in a bucket is read: an MCAP file there, by ranges; others in a copy on this computer."""
     found = place(uri)
     if not isinstance(found, Remote):

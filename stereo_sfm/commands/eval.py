@@ -176,11 +176,10 @@ def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None
     """The ground truth in a file, and that file; or of a source, opened as the run opened its own."""
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.drivers.ground_truth import read_trajectory
-    from stereo_sfm.fleet.copies import fetched
-    from stereo_sfm.storage.remote import Remote, is_uri, place
+    from stereo_sfm.drivers.source import local_place
+    from stereo_sfm.storage.remote import is_uri
 
-    where = place(spec) if is_uri(spec) and not spec.endswith(".mcap") else Path(spec).expanduser()
-    path = fetched(where) if isinstance(where, Remote) else where
+    path = Path(local_place(spec) if is_uri(spec) and "?" not in spec else spec).expanduser()
     if path.is_file() and path.suffix != ".mcap":
         return read_trajectory(path), path
     with SourceChoice(spec, opening.rig, rectify=opening.rectify)() as opened:

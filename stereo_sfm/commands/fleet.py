@@ -66,12 +66,15 @@ def _run(plan: Plan, address: str | None) -> int:
         if not result.get("resumed"):
             version = f", version {result['version']}" if result.get("version") else ""
             print(f"{count} {job.name}: {'; '.join(why) or 'ok'}{version}", file=sys.stderr)
-    deleted = forget_images(plan, walks, datetime.date.today(), waiting)
-    stores = sorted({walk.store for walk in walks})
-    forgotten = forget_versions(plan, sorted({walk.store for walk in walks if walk.name}))
-    nights = len({(walk.store, walk.night) for walk in walks})
+    found = [walk for walk in walks if not walk.error]
+    stores = sorted({walk.store for walk in found})
+    try:
+        deleted = forget_images(plan, walks, datetime.date.today(), waiting)
+    finally:  # neither stops the other
+        forgotten = forget_versions(plan, stores)
+    nights = len({(walk.store, walk.night) for walk in found})
     print(
-        f"{len(walks)} walks in {nights} nights of {len(stores)} stores:"
+        f"{len(found)} walks in {nights} nights of {len(stores)} stores:"
         f" {count - again} of {count} jobs done now, {failed} failed"
         + (f", {deleted / 1e9:.2f} GB of recordings deleted" if deleted else "")
         + (f", {forgotten / 1e9:.2f} GB of old versions deleted" if forgotten else "")
@@ -81,11 +84,10 @@ def _run(plan: Plan, address: str | None) -> int:
 
 def _report(plan: Plan, folder: Path, query: str | None) -> int:
     from stereo_sfm.fleet.catalogue import ask, opened
+    from stereo_sfm.fleet.plan import stores_of
     from stereo_sfm.fleet.report import report
-    from stereo_sfm.storage import objects
 
-    stores = [name.strip() for name in plan.fleet.stores.split(",") if name.strip()]
-    with opened(plan.root, stores or objects.folders(plan.root)) as connection:
+    with opened(plan.root, stores_of(plan)) as connection:
         if query is not None:
             print("\n".join(ask(connection, query)))
             return 0

@@ -139,7 +139,7 @@ def mapped(name: str, config: Config) -> SavedMap:
     from stereo_sfm.maps.saved_map import load_map
     from stereo_sfm.storage.remote import Remote, is_uri, place
 
-    if is_uri(name) and not name.endswith(".mcap"):
+    if is_uri(name) and "?" not in name and not name.endswith(".mcap"):
         found = place(name)
         name = str(fetched(found) if isinstance(found, Remote) else found)
     for folder in (Path(name), Path(name) / "map"):

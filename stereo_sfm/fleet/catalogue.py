@@ -174,7 +174,7 @@ def opened(root: Remote, stores: Iterable[str]) -> Generator[Any]:
             place = root / store / "catalogue"
             names = [name for name, _, _ in objects.listed(place) if _TABLE.fullmatch(name)]
             if names:
-                (Path(folder) / store).mkdir()
+                (Path(folder) / store).mkdir(parents=True)
                 paths |= {Path(folder) / store / name: place / name for name in names}
                 refused += [(store, session) for session in read_head(root / store / "map").refused]
         if not paths:

@@ -162,7 +162,7 @@ def stores_of(plan: Plan) -> list[str]:
     Raises:
         StereoSfmError: there is no such bucket, or no right to list it.
     """
-    wanted = [name.strip() for name in plan.fleet.stores.split(",") if name.strip()]
+    wanted = list(dict.fromkeys(name.strip() for name in plan.fleet.stores.split(",") if name.strip()))
     return wanted or sorted({*objects.folders(plan.root), *(walk.store for walk in plan.listed)})
 
 

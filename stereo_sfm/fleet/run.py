@@ -16,7 +16,7 @@ from stereo_sfm.fleet.steps import BEGUN, RESULT, Night, job_name, map_walk, rea
 from stereo_sfm.fleet.versions import read_head, read_version
 from stereo_sfm.jobs import Job, Limits, Result, run_jobs
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import SUM
+from stereo_sfm.storage.folders import sum_of
 from stereo_sfm.storage.remote import Remote
 
 
@@ -101,16 +101,18 @@ def _forget_work(plan: Plan, store: str, walks: list[Walk], today: datetime.date
     place = plan.root / store / "work"
     names = (name.split("/") for name, _, _ in objects.listed(place))
     made = {parts[0] for parts in names if parts[1:2] == ["map"]}
+    old = [k for k in sorted(made) if _age(night_of(k), place / k, today) > plan.fleet.keep_images_days]
+    if not old:
+        return 0
     waited_for = {walk.key for walk in walks}
     head = read_head(plan.root / store / "map")
-    version = read_version(plan.root / store / "map", head.version) if made and head.version else None
-    deleted = 0
-    for key in sorted(made):
+    version = read_version(plan.root / store / "map", head.version) if head.version else None
+
+    def needed(key: str) -> bool:
         result = read_json(place / key / RESULT) or {}
-        needed = key in waited_for and not holds(head, version, str(result.get("id")))
-        if not needed and _age(night_of(key), place / key, today) > plan.fleet.keep_images_days:
-            deleted += _delete(place / key / "map")
-    return deleted
+        return not holds(head, version, str(result.get("id")))
+
+    return sum(_delete(place / key / "map") for key in old if key not in waited_for or not needed(key))
 
 
 def forget_versions(plan: Plan, stores: Iterable[str]) -> int:
@@ -149,7 +151,7 @@ def _delete(place: Remote) -> int:
         return sum(size for _, size, _ in files)
     with contextlib.suppress(objects.Missing):  # somebody else was first
         size = objects.size_and_tag(place)[0]
-        objects.delete([place, place.parent / f"{place.name}{SUM}"])
+        objects.delete([place, sum_of(place)])
         return size
     return 0
 

@@ -61,7 +61,7 @@ class Bundle:
     obs_kf: I64  # (M,) row of world_T_kf
     obs_pt: I64  # (M,) row of points
     uv_left: F64  # (M, 2) px, NaN where not observed
-    uv_right: F64  # (M, 2) px, NaN where not observed; only the row NaN: u alone counts (rectified, depth)
+    uv_right: F64  # (M, 2) px, NaN where not observed; only the row NaN: u alone counts (rectified)
     sigma: F64 | None = None  # (M, 2) px of (left, right); None: 1
     level: Level | None = None  # what the keyframes measured of gravity; None: nothing
     motions: MotionFactors | None = None  # what IMU and wheels measured between them; None: nothing

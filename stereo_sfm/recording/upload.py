@@ -105,12 +105,15 @@ class Uploader:
         return count
 
     def _send(self, segment: Segment) -> int:
-        paths = segment.unsent(self._black_box)
-        for path in paths:
+        count = 0
+        for path in segment.unsent(self._black_box):
+            if not path.is_file():  # the quota has deleted it meanwhile
+                continue
             digest = sha256(path)
             send_file(path, self.to / path.parent.name / path.name, self._pace, self._over.is_set)
             add_sent(segment.folder, sums_text({path.name: digest}))
-        return len(paths)
+            count += 1
+        return count
 
     def _finish(self, folder: Path) -> None:
         """All of a recording is up."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -174,10 +175,11 @@ def check_sums(folder: Path, name: str) -> None:
 def _check_sum(file: Path, remote: Remote) -> None:
     """Compare a file with the checksum beside its object, if there is one. Raises StereoSfmError as `check_sums`."""
     try:
-        digest = objects.read(sum_of(remote)).partition(b" ")[0]
+        said = objects.read(sum_of(remote)).decode("utf-8", "replace")
     except objects.Missing:
         return
-    if digest != sha256(file).encode():
+    digests = {digest.lower() for digest in re.findall(r"\b[0-9a-fA-F]{64}\b", said)}  # as any program writes them
+    if digests and sha256(file) not in digests:
         raise StereoSfmError(f"{remote} is not what was sent (its checksum is wrong): send it again")
 
 

@@ -82,5 +82,9 @@ def _roots() -> tuple[Path, Path]:
 def _take_over(left: Spool, file: Path) -> None:
     """Move what an earlier version left: it is whole at its new place, or still at the old one."""
     part = file.with_name(f".{file.name}.moved")
-    shutil.move(left.file, part)
+    try:
+        shutil.move(left.file, part)
+    except OSError:  # such as a full disk
+        part.unlink(missing_ok=True)
+        raise
     part.replace(file)

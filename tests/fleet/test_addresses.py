@@ -9,10 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from stereo_sfm.calib.formats import save_rig
 from stereo_sfm.cli import COMMANDS, _build_parser, main
+from stereo_sfm.commands.eval import load_reference
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.fleet.editing import checked_out, session_id
 from stereo_sfm.fleet.versions import current, released
+from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.put_session import put_session
 from stereo_sfm.maps.saved_map import load_map, save_map
 from stereo_sfm.storage import objects
@@ -91,9 +95,21 @@ def test_truth_and_export_by_address(place: str, tmp_path: Path, monkeypatch: py
     truth = f"{place}/truth.tum"
     objects.write(Remote.of(truth), (run / "trajectory_map.tum").read_bytes())
     assert main(["eval", str(run / "trajectory_map.tum"), "--ref", truth]) == 0
+    assert main(["eval", str(run / "trajectory_map.tum"), "--ref", f"file://{run}/trajectory_map.tum"]) == 0
     monkeypatch.chdir(tmp_path)
     assert main(["export", f"{place}/run", "--format", "kitti"]) == 0
     assert (tmp_path / "export_map.kitti").is_file()
+
+
+def test_truth_of_a_source_by_its_address_and_options(place: str, tmp_path: Path) -> None:
+    walk, rig = tmp_path / "walk.mcap", tmp_path / "rig.yaml"
+    assert main(["record", "sim:loop?frames=5", "-o", str(walk), "-q"]) == 0
+    with open_source(str(walk)) as source:
+        save_rig(source.rig, rig)
+    objects.write(Remote.of(f"{place}/walk.mcap"), walk.read_bytes())
+    for source in (f"{place}/walk.mcap", f"{place}/walk.mcap?rig={rig}", f"file://{walk}?rig={rig}"):
+        truth, file = load_reference(source, Opening())
+        assert file is None and len(truth) == 5
 
 
 @pytest.mark.parametrize("source", ["s3://KEY:SECRET@b/x.mcap", "mcap:s3://KEY:SECRET@b/x.mcap"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import json
 import urllib.parse
@@ -81,6 +82,12 @@ def test_a_store_that_cannot_be_listed_stops_no_other(plan: Plan, session: Path,
     assert not results["odd"]["ok"] and "give it another name" in results["odd"]["error"]
     assert results[f"{STORE} {NIGHT}"]["version"] == 1
     assert forget_images(plan, found, datetime.date(2027, 1, 1)) > 0  # of the other one
+
+
+def test_a_store_that_is_named_twice_is_one(plan: Plan, session: Path) -> None:
+    send_folder(session, walks(plan) / "r1" / f"{NIGHT}_2200")
+    twice = dataclasses.replace(plan, fleet=dataclasses.replace(plan.fleet, stores=f"{STORE}, {STORE}"))
+    assert len(find_walks(twice)[0]) == 1
 
 
 def test_no_store_that_can_be_listed_is_one_line(plan: Plan, s3: Server, monkeypatch: pytest.MonkeyPatch) -> None:

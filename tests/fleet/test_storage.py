@@ -15,7 +15,7 @@ from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.recording.segments import Segment, new_recording
 from stereo_sfm.recording.upload import Uploader
 from stereo_sfm.storage import objects
-from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_file, send_folder, sum_of
+from stereo_sfm.storage.folders import SUMS, Pace, fetch, send_file, send_folder, sha256, sum_of
 from stereo_sfm.storage.objects import Missing, Unreachable
 from stereo_sfm.storage.remote import Remote, place
 from stereo_sfm.storage.stream import PAGE, RangeStream
@@ -210,6 +210,10 @@ def test_a_single_file_is_checked_as_well(place: str, tmp_path: Path) -> None:
             fetch(target)
     objects.delete([sum_of(target)])  # of another program
     assert fetch(target).read_bytes() == b"2" * 1000
+    right = sha256(fetch(target)).upper()
+    for text in (right, f"SHA256 (there.mcap) = {right}", "no checksum"):  # as other programs write it
+        objects.write(sum_of(target), f"{text}\n".encode())
+        assert fetch(target).read_bytes() == b"2" * 1000
 
 
 def test_a_pace_is_kept(tmp_path: Path) -> None:

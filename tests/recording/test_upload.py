@@ -142,6 +142,20 @@ def test_a_black_box_keeps_what_is_marked_until_it_is_sent(tmp_path: Path, bucke
     assert sum(name.endswith(".images.mcap") for name in bucket.held) == 2
 
 
+def test_what_the_quota_deletes_meanwhile_stops_no_upload(
+    tmp_path: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segments, send = recorded(tmp_path, 2), upload.send_file
+
+    def sent(path: Path, remote: Remote, *more: Any) -> None:
+        send(path, remote, *more)
+        segments[0].images.unlink(missing_ok=True)
+
+    monkeypatch.setattr(upload, "send_file", sent)
+    assert Uploader(tmp_path, TO).send_all() == 3
+    assert segments[1].images.name in bucket.sent and segments[0].images.name not in bucket.sent
+
+
 def test_on_a_full_disk_what_is_sent_makes_room(
     tmp_path: Path, bucket: Bucket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
